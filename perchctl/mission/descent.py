@@ -158,8 +158,15 @@ def begin_landing(state: PlannerState) -> PlannerState:
 
 
 def enter_descent(state: PlannerState, previous_state: PlannerState) -> PlannerState:
-    """Return the state at the start of a landing; `previous_state` is the state before the
-    transition."""
+    """Return the state at the start of a descent; `previous_state` is the state before the
+    transition.
+
+    The setpoint moves to the position of a vehicle that hovers in place, and the hover thrust is
+    estimated for the descent. A landing that the firmware already executes counts as commanded, and
+    motors that are already off count as stopped, so that no command starts them again. After a
+    press, the vehicle counts as within the magnet's reach. With only accelerometer and attitude
+    left, the belief switches to dead reckoning.
+    """
     b, tel, old = state.belief, state.belief.telemetry, previous_state.belief
     heard = b.attitude_age_s <= b.profile.safety.proof_age_s
     if (
@@ -273,10 +280,11 @@ def descend(c: Context) -> Action:
 
 
 def has_descent_command_reached_minimum(c: Context) -> bool:
-    """True if a landing has reached its end: the raw thrust is at its minimum or, if the end of the
-    landing could not be confirmed in time (`LANDING_UNCONFIRMED`), the setpoint is at most
-    `landing.handover_m` above the take-off position. The motors must then be stopped, or the
-    firmware's supervisor locks the vehicle when the setpoints end."""
+    """True if a landing has reached its end: the last commanded raw thrust is at its minimum
+    (`MIN_COMMANDED_TO_HOVER_THRUST_RATIO` times hover thrust) or, if the end of the landing could
+    not be confirmed in time (`LANDING_UNCONFIRMED`), the setpoint is at most `landing.handover_m`
+    above the take-off position. The motors must then be stopped, or the firmware's supervisor locks
+    the vehicle when the setpoints end."""
     setpoint, takeoff_position_m = c.state.setpoint, c.belief.takeoff_position_m
     if setpoint is not None and takeoff_position_m is not None:
         low = setpoint.z_m <= takeoff_position_m[2] + c.planner.landing.handover_m
@@ -309,7 +317,10 @@ def _is_falling_free(c: Context) -> bool:
 
 
 def _is_standing_on_floor(c: Context) -> bool:
-    """True if the vehicle is proven to stand on the floor."""
+    """True if the vehicle is proven to stand on the floor: `ON_FLOOR` has been true for
+    `ON_FLOOR_DWELL_S`; or, in a descent by raw thrust with valid positions from the target, the
+    vehicle is lower than `MAX_HEIGHT_TO_COUNT_AS_LANDED_M`, slower than
+    `MAX_VERTICAL_SPEED_OF_MOTIONLESS_VEHICLE_MPS`, and cannot be on the magnet."""
     b = c.belief
     if b.is_telemetry_fresh and c.true_for_s(ON_FLOOR) >= ON_FLOOR_DWELL_S:
         return True

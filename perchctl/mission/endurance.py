@@ -129,8 +129,10 @@ class MissionDurations:
 
 
 def predict_durations(c: Context) -> MissionDurations:
-    """Predict how long this attempt, each retry and the landing take, from the height of the known
-    target."""
+    """Predict the times, s, that the rest of this attempt, each retry and the landing take, from
+    the height of the known target, the speeds in the profile, and typical times of the stages
+    without a set speed. A hover counts with its whole duration. The target's position must be
+    known."""
     planner, hover = c.planner, c.planner.hover
     top_z_m = c.belief.target.vehicle_world_z_when_touching_m - (
         0.0 if hover is None else hover.below_m
@@ -165,7 +167,8 @@ def predict_durations(c: Context) -> MissionDurations:
 
 
 def is_charge_too_low_for_any_attempt(c: Context) -> bool:
-    """True if the charge is too low for an attempt at a known target."""
+    """True if the battery outlook allows no attempt at a target whose world position is known.
+    Always False if `safety.energy_gate` is off."""
     gated = c.safety.energy_gate and c.belief.target.world_position_m is not None
     return gated and not c.state.battery.affordable_attempts
 

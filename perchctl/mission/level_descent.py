@@ -153,7 +153,9 @@ def _is_target_redetected_without_velocity(c: Context) -> bool:
 
 
 def _climb_rate_measured_at_s(c: Context) -> float:
-    """Return the time at which telemetry or pictures measured the vertical speed."""
+    """Return the loop time, s, at which the newest climb rate was measured: the time of the newest
+    telemetry or, if the telemetry is old and newer pictures show the target, that of the newest
+    picture minus the lag of its low-pass filter."""
     seen = _visual_motion_if_telemetry_old(c)
     return c.telemetry.t_s if seen is None else seen.t_s - VISUAL_VELOCITY_TIME_CONSTANT_S
 
@@ -310,9 +312,14 @@ def _find_floor_detection_time_s(
 def _compute_thrust_for_sink_rate(
     c: Context, hover_thrust: float, climb_mps: float, height_m: float
 ) -> float:
-    """Return the rate controller's thrust, 0..65535, by the equation in the module docstring:
-    `hover_thrust` is T_h, and `climb_mps` is v + u. Near the floor, the sink rate setpoint is
-    smaller; `height_m` is the height above the ground."""
+    """Return the thrust, 0..65535, of the proportional sink-rate controller, by the equation in the
+    module docstring: `hover_thrust` is T_h, and `climb_mps` (positive upwards) is v + u, the climb
+    rate including the change that recent commands cause.
+
+    The sink rate setpoint s is smaller below `MAX_NEAR_FLOOR_HEIGHT_M`, or if `height_m` (above the
+    ground) may be wrong, or if v comes from pictures. The gain k falls with the age of v. The
+    cosine is at least `MIN_TILT_COSINE_DIVIDING_THRUST`.
+    """
     b = c.belief
     # Late pictures, and positions that have diverged, may place the floor half a metre too low.
     is_height_wrong = b.camera_imu_mismatch.camera_latency_error_s != 0.0 or b.is_position_diverged
@@ -358,8 +365,9 @@ def _forget_contact_after_fall(c: Context) -> PlannerState:
 
 
 def _is_touchdown_overdue(c: Context) -> bool:
-    """True if the vehicle has descended without a position for so long that it must have landed or
-    be hanging."""
+    """True if the vehicle, without a position or with diverged positions, has descended for longer
+    than the descent from its start height takes at `MIN_MEAN_DESCENT_SINK_RATE_MPS`, plus a margin:
+    it must then have landed or be hanging. Always False with a position."""
     state, b = c.state, c.belief
     if b.dead_reckoning_began_at_s is None and not b.is_position_diverged:
         return False
@@ -443,8 +451,8 @@ def _compute_braking_roll_pitch_rad(c: Context) -> tuple[float, float]:
 
 
 def _world_to_heading_xy(x: float, y: float, yaw_rad: float) -> tuple[float, float]:
-    """Rotate a world vector (x, y) into the axes, ahead and left, of a vehicle with the heading
-    `yaw_rad`."""
+    """Rotate the horizontal vector (`x`, `y`) from world axes into the axes, ahead and left, of a
+    vehicle with the heading `yaw_rad` (counter-clockwise from world x)."""
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return x * cos + y * sin, y * cos - x * sin
 

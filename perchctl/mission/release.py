@@ -177,7 +177,8 @@ def hold_contact_by_position(c: Context) -> Action:
 
 
 def has_thrust_ramped_down(c: Context) -> bool:
-    """True if the downward ramp of raw thrust has brought the motors to rest."""
+    """True if the downward ramp of raw thrust has lasted its whole duration, `complete.ramp_s`, so
+    that the commanded thrust no longer turns the motors. False if no ramp has begun."""
     weight_transfer_began_at_s = c.state.weight_transfer_began_at_s
     return (
         weight_transfer_began_at_s is not None
@@ -257,8 +258,10 @@ def catch_falling_vehicle(c: Context) -> Action | None:
 
 
 def _braking_setpoint_world_xy_m(c: Context) -> tuple[float, float]:
-    """Return x and y of a setpoint that brakes a lateral velocity that the state estimate has not
-    measured."""
+    """Return world x and y, m, of a setpoint that brakes the lateral velocity by which dead
+    reckoning exceeds the state estimate, which has not measured it. The setpoint is behind the
+    vehicle, opposite to this velocity, by the velocity (at most `MAX_BRAKED_LATERAL_SPEED_MPS` per
+    axis) divided by `ONBOARD_POSITION_GAIN_PER_S`."""
     tel, reckoned_mps = c.telemetry, c.belief.dead_reckoning.velocity_mps
     missing_mps = (reckoned_mps[i] - tel.velocity_mps[i] for i in range(2))
     x_mps, y_mps = (

@@ -263,9 +263,13 @@ def report_rest(
 
 
 def find_touchdown(c: Context) -> Touchdown | None:
-    """Return the newest impact from below if it may be a touchdown, else None.
+    """Return the newest impact from below if it may be the touchdown. Return None if the vehicle is
+    perched, if the impact was more than `MAX_TOUCHDOWN_TO_MOTOR_STOP_S` before the motors stopped
+    (or before now, if they still turn), or if a valid position shows that it was too far above the
+    final position.
 
-    The speed comes from the state estimate if that is trusted, otherwise from dead reckoning.
+    The downward speed, m/s, comes from dead reckoning if that has replaced the state estimate or if
+    positions have diverged; otherwise, it comes from the state estimate.
     """
     b = c.belief
     tel, imu, dead_reckoning = c.telemetry, b.imu, b.dead_reckoning

@@ -209,7 +209,8 @@ def is_position_lost(c: Context) -> bool:
 
 
 def is_outside_fence(c: Context) -> bool:
-    """True if the vehicle is further from its start than the fence allows."""
+    """True if the vehicle's estimated horizontal distance from its take-off position exceeds
+    `safety.fence_radius_m`. False while the take-off position is unknown."""
     takeoff_position_m = c.belief.takeoff_position_m
     if takeoff_position_m is None:
         return False
@@ -249,7 +250,9 @@ def wrong_camera_latency_reason(c: Context) -> str:
 
 
 def is_camera_mounting_contradicted(c: Context) -> bool:
-    """True if the target moves along with the vehicle, or appears below it."""
+    """True if the camera seems to be mounted differently from the profile: the target moves along
+    with the vehicle, the pictures fit the accelerometer only with a rotated camera, or the target
+    has appeared below the vehicle for `TARGET_BELOW_VEHICLE_DWELL_S`."""
     b = c.belief
     below = c.true_for_s(TARGET_BELOW_VEHICLE) >= TARGET_BELOW_VEHICLE_DWELL_S
     return (
@@ -283,13 +286,16 @@ def wrong_camera_mounting_reason(c: Context) -> str:
 
 
 def is_held_by_target(c: Context) -> bool:
-    """True if the target's magnet holds the vehicle although no press has proven a contact."""
+    """True if thrust, position and motion have shown for `HANGING_CONFIRMATION_DWELL_S` that
+    something holds the vehicle, and this is the target's magnet, although no press has proven a
+    contact."""
     hangs = c.true_for_s(HANGING) >= HANGING_CONFIRMATION_DWELL_S
     return hangs and c.support is Support.MAGNET
 
 
 def is_held_by_other_object(c: Context) -> bool:
-    """True if something holds the vehicle away from the target's height or from its axis."""
+    """True if something has held the vehicle for `HELD_BY_OTHER_OBJECT_DWELL_S`, and the vehicle is
+    certainly away from the target's height or from its axis."""
     hangs = c.true_for_s(HANGING) >= HELD_BY_OTHER_OBJECT_DWELL_S
     return hangs and c.support is Support.HELD_BY_OTHER_OBJECT
 
@@ -308,8 +314,14 @@ def is_climb_blocked_off_target(c: Context) -> bool:
 
 
 def is_thrust_insufficient_for_press(c: Context) -> bool:
-    """True if no thrust remains for a press: measured at full thrust, or predicted before the
-    press. A mission that hovers does not press, so nothing is predicted for it."""
+    """True if no thrust remains for a press, measured or predicted. Measured: the vehicle has not
+    climbed for `THRUST_SATURATED_WITHOUT_CLIMB_DWELL_S` at full thrust. Predicted, at the stand-off
+    before the press: hover thrust exceeds `MIN_SATURATED_TO_FULL_THRUST_RATIO` times the largest
+    press thrust.
+
+    A mission that hovers does not press, so nothing is predicted for it. False while a press is
+    being ended.
+    """
     if c.state.must_end_press:
         return False
     if c.true_for_s(THRUST_SATURATED_WITHOUT_CLIMB) >= THRUST_SATURATED_WITHOUT_CLIMB_DWELL_S:
@@ -333,8 +345,8 @@ def _outcome_after_supervisor_lock(previous_outcome: Outcome | None) -> Outcome:
 
 
 def has_time_for_all_attempts_run_out(c: Context) -> bool:
-    """True if the time for all attempts, plus the duration of the hover in a mission that hovers,
-    has run out."""
+    """True if more than `planner.perching_time_s`, plus the duration of the hover in a mission that
+    hovers, has passed since the start of the flight."""
     hover = c.planner.hover
     allowed_s = c.planner.perching_time_s + (0.0 if hover is None else hover.duration_s)
     return c.t_s - c.state.flight_started_at_s > allowed_s

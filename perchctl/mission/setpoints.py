@@ -219,8 +219,11 @@ def limit_vector_length(x: float, y: float, max_length: float) -> tuple[float, f
 def correct_setpoint(
     c: Context, reference: PositionSetpoint, *, corrects_height: bool = True
 ) -> PositionSetpoint:
-    """Return the setpoint that brings the vehicle to `reference`, by the equations in the module
-    docstring; without `corrects_height`, at the reference's own height."""
+    """Return the setpoint to send so that the vehicle reaches `reference` in spite of wind and
+    onboard control errors, by the equations in the module docstring: the reference plus the lateral
+    integral, the lateral feedback (`_lateral_feedback_shift`), and a height correction of at most
+    `MAX_HEIGHT_CORRECTION_M` from the errors of height and vertical speed (world axes, m). Without
+    `corrects_height`, the height is that of the reference."""
     tel = c.telemetry
     rise = (
         HEIGHT_ERROR_GAIN * (reference.z_m - tel.position_m[2])

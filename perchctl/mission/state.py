@@ -60,7 +60,9 @@ class HoverErrors:
         gear_to_hover_position_m: tuple[float, float, float],
         vehicle_to_target_yaw_rad: float,
     ) -> HoverErrors:
-        """Return the errors with those of one more frame at `t_s`."""
+        """Return the errors with those of one more frame at `t_s`: the vector from the gear to the
+        hover position (forward, left, up) in the level frame, m, and the target's heading relative
+        to the vehicle's, rad."""
         errors = (*gear_to_hover_position_m, vehicle_to_target_yaw_rad)
         x2, y2, z2, yaw2 = (
             s + e * e for s, e in zip(self.squared_error_sums_xyz_yaw, errors, strict=True)
@@ -120,9 +122,8 @@ class PlannerState:
     must_end_press: bool = False
     catch_setpoint_height_above_vehicle_m: float | None = None
     """Height of the setpoint above the vehicle during a catch, m; None outside a catch."""
-    vehicle_world_z_when_blocked_m: float | None = (
-        None  #: height at which an obstacle blocked the vehicle
-    )
+    #: height at which an obstacle blocked the vehicle
+    vehicle_world_z_when_blocked_m: float | None = None
     weight_transfer_began_at_s: float | None = None  #: start of the transfer by raw thrust
     motor_stop_commanded_at_s: float | None = None  #: first command to stop the motors
     last_stop_or_land_command_at_s: float | None = None  #: last command to land or to stop motors

@@ -223,7 +223,16 @@ def process_noise_covariance(dt_s: float, target_position_m: Array, setup: Filte
 
 def _acceleration_covariance(noise: ProcessNoise, target_position_m: Array) -> Array:
     """Return the covariance (4, 4) that process noise adds per second to the rates of (yaw, x, y,
-    z)."""
+    z): rad^2/s^2 for the yaw rate and m^2/s^2 for the velocities, each per second. The axes x, y
+    and z are those of the track's frame, the level frame or the world frame.
+
+    In a level frame with an angular acceleration, the result depends on `target_position_m` (3,),
+    m, the vector r from the gear, the frame's origin, to the target in level axes: an angular
+    acceleration a of the frame accelerates the target by the cross product of a and r. With the
+    same spectral density w, rad^2/s^3, of a about each axis, this adds w (|r|^2 I - r r^T) to the
+    covariance of the velocities. In the world frame, which does not turn with the vehicle, the
+    target's position has no effect.
+    """
     if noise.level_frame_angular_acceleration_sigma_radps2 == 0.0:
         return noise.yaw_xyz_rate_noise_cov_per_s
     turned2 = (
@@ -238,7 +247,9 @@ def _acceleration_covariance(noise: ProcessNoise, target_position_m: Array) -> A
 
 
 def start_track(measurement: TrackMeasurement, t_s: float, setup: FilterSetup) -> MarkerTrack:
-    """Return a new track with the measurement at `t_s` as its initial state."""
+    """Return a new track at `t_s` with the measured yaw and position as its state and zero rates.
+    Its covariance is `setup.P0`, with the measurement's own covariance, if it has one, for yaw and
+    position."""
     x = np.zeros(8)
     x[MEASURED] = measurement.z
     x[YAW] = wrap_rad(float(measurement.z[0]))
@@ -332,7 +343,9 @@ def _kalman_update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array
 
 
 def predict_track(track: MarkerTrack, t_s: float, setup: FilterSetup) -> MarkerTrack:
-    """Return the track predicted to time `t_s`, without a measurement."""
+    """Return the track predicted to time `t_s`, without a measurement; unchanged if `t_s` is not
+    after the track's time. More than `MAX_PREDICTION_DURATION_S` after the track's time, the target
+    stays where it was predicted to be at that limit."""
     dt_s = min(t_s - track.t_s, MAX_PREDICTION_DURATION_S)
     if dt_s <= 0.0:
         return track

@@ -84,8 +84,9 @@ def horizontal_distance_to_own_target_m(
 def foreign_target_message(
     pose: MarkerPose, attitude: VehicleState | None, own_target: OwnTargetPosition, setup: PoseSetup
 ) -> str | None:
-    """Return a message if a detected target belongs to another vehicle; None if it may be this
-    vehicle's own target."""
+    """Return a message if the target with this pose is further than `own_target.max_distance_m`
+    from the known position of the vehicle's own target, so that it belongs to another vehicle. None
+    if it may be the vehicle's own, or if that position or the vehicle's attitude is unknown."""
     if attitude is None or own_target.xy_world_m is None:
         return None
     distance_m = horizontal_distance_to_own_target_m(pose, attitude, own_target, setup)

@@ -185,9 +185,8 @@ _ESTIMATE_JUMPED_TEXT = "the state estimate jumped, but the target did not"
 _PREVIOUS_POSE_WRONG_TEXT = (
     "the target is where it was expected before the last pose: that pose may have been wrong"
 )
-_MAX_ACCEPTED_INNOVATION_CHI2 = (
-    25.0  # With four dimensions, 5 of 100 000 squared distances exceed it by chance.
-)
+# With four dimensions, 5 of 100 000 squared distances exceed it by chance.
+_MAX_ACCEPTED_INNOVATION_CHI2 = 25.0
 _MAX_RANGE_DIFFERENCE_SIGMAS = 4.0
 # Errors that no covariance includes (calibration, print, latency): constants and fractions of the
 # range.
@@ -339,7 +338,11 @@ def update_lock(
     lock: TargetLock | None, track: MarkerTrack, frame_pose: FramePose, verdict: GateVerdict
 ) -> TargetLock:
     """Return the updated lock after the gate has accepted `frame_pose`. `track` is the track that
-    this pose has updated."""
+    this pose has updated.
+
+    The count of accepted frames and the previous track are kept, unless the track has restarted at
+    a rival or the frame (level or world) of the tracks has changed; then the lock begins anew.
+    """
     anew = verdict.restarts_track and not verdict.restarts_at_locked_target
     before = (
         None
@@ -615,8 +618,12 @@ def predict_corners(
 def update_last_pose(
     previous: LastPose | None, pose: MarkerPose, attitude: VehicleState | None, setup: PoseSetup
 ) -> LastPose:
-    """Return `pose` as the new last pose. The errors of the vehicle's estimated motion are updated
-    with the motion since `previous`."""
+    """Return `pose` as the new last pose, with the vehicle's `attitude` (None if unknown).
+
+    The running errors of the vehicle's estimated motion are updated by comparing it with the motion
+    seen since `previous`, across the line of sight. They stay unchanged if an attitude is unknown
+    or the previous pose is more than `MAX_TRACK_GAP_S` older.
+    """
     if previous is None:
         return LastPose(pose, attitude)
     then, passed_s = previous.attitude, pose.t_s - previous.pose.t_s

@@ -109,8 +109,7 @@ class NormalEquationSums(NamedTuple):
 
     The error of a reading is its deviation, V, from what `TYPICAL_FULL_THRUST_SAG_V` and
     `TYPICAL_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO` predict. The fit models this error as a sum of
-    two
-    products: the thrust, as a fraction of full thrust, times the deviation of the sag from its
+    two products: the thrust, as a fraction of full thrust, times the deviation of the sag from its
     typical value; and the drop of the resting voltage since take-off, V, calculated from the
     assumed current, times the deviation of the discharge ratio.
     """
@@ -189,8 +188,12 @@ def update_battery_fit_from_telemetry(
     dt_s: float,
     battery_capacity_mah: float,
 ) -> BatteryFit:
-    """Return the fit after a new sample, taken `dt_s` after the previous one. A battery reading
-    older than `MAX_BATTERY_READING_AGE_S` counts as missing."""
+    """Return the fit `dt_s` later, in a tick whose newest sample is `telemetry`, for a battery with
+    the full charge `battery_capacity_mah`.
+
+    `reading_age_s` is the age of the sample's battery voltage; a reading older than
+    `MAX_BATTERY_READING_AGE_S` counts as missing (see `update_battery_fit`).
+    """
     reading_v = telemetry.battery_v if reading_age_s <= MAX_BATTERY_READING_AGE_S else math.nan
     power_train = identify_power_train(telemetry)
     return update_battery_fit(
@@ -281,8 +284,8 @@ def update_battery_fit(
 
 
 def fit_battery_voltage_model(state: BatteryFit) -> BatteryVoltageModel:
-    """Return the sag model that fits the readings best: least squares, regularized by the typical
-    values and bounded."""
+    """Return the battery voltage model that fits the readings best: least squares, regularized by
+    the typical values and bounded."""
     a, b, c, p, q = state.normal_equation_sums
     a += FULL_THRUST_SAG_SIGMA_V**-2
     c += TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO_SIGMA**-2
@@ -328,8 +331,13 @@ def _interpolate(xs: tuple[float, ...], ys: tuple[float, ...], x: float) -> floa
 def _add_voltage_reading_to_sums(
     state: BatteryFit, dt_s: float, battery_v: float
 ) -> NormalEquationSums:
-    """Return the sums after one more voltage reading. The unknowns of the fit are the deviations
-    from the typical sag and from the typical discharge ratio."""
+    """Return the sums after one more reading `battery_v`, V, under load, with a weight proportional
+    to `dt_s`, the time that the reading covers. Older readings lose weight with the time constant
+    `BATTERY_FIT_FORGETTING_TIME_CONSTANT_S`.
+
+    The unknowns of the fit are the deviations of the full-thrust sag, V, and of the discharge ratio
+    from their typical values. `state.takeoff_rest_v` must be known.
+    """
     assert state.takeoff_rest_v is not None
     begun = charge_fraction_from_rest_v(state.takeoff_rest_v)
     counted = max(

@@ -164,7 +164,8 @@ class Belief:
 
     @cached_property
     def is_imu_fresh(self) -> bool:
-        """True if attitude, acceleration and thrust are recent enough to count as evidence."""
+        """True if attitude, acceleration and thrust are recent enough to count as evidence: at most
+        `safety.proof_age_s` old."""
         return self.attitude_age_s <= self.profile.safety.proof_age_s
 
     @cached_property
@@ -177,7 +178,8 @@ class Belief:
 
     @cached_property
     def is_telemetry_fresh(self) -> bool:
-        """True if all parts of the telemetry are recent enough to count as evidence."""
+        """True if all parts of the telemetry are recent enough to count as evidence: the oldest
+        part is at most `safety.proof_age_s` old."""
         return self.telemetry_age_s <= self.profile.safety.proof_age_s
 
     # --- Reliability of the position ---
@@ -212,7 +214,9 @@ class Belief:
 
     @cached_property
     def is_estimate_variance_too_large(self) -> bool:
-        """True if the variance of velocity or position is too large for position control."""
+        """True if the largest variance of velocity or position exceeds the limit for position
+        control, `safety.flight_velocity_variance_m2ps2` or `safety.flight_variance_m2`. Also true
+        if a variance is missing although the vehicle should report it."""
         safety = self.profile.safety
         return (
             self.max_axis_velocity_variance_m2ps2 > safety.flight_velocity_variance_m2ps2
@@ -341,17 +345,20 @@ class Belief:
 
     @property
     def ground_z_m(self) -> float:
-        """Height of the ground at the start of the flight, m; 0 if unknown."""
+        """World z, m, in the frame of the state estimate, of the position where the flight started;
+        0 if unknown. Wrong by as much as the estimated height has drifted since."""
         return self.takeoff_position_m[2] if self.takeoff_position_m else 0.0
 
     @cached_property
     def height_m(self) -> float:
-        """Height above the ground at the start of the flight, m."""
+        """Estimated height above the position where the flight started, m: world z of the vehicle's
+        origin minus `ground_z_m`. Wrong by as much as the state estimate has drifted."""
         return self.obs.telemetry.position_m[2] - self.ground_z_m
 
     @cached_property
     def tilt_rad(self) -> float:
-        """Angle between the vehicle's vertical axis and the world's, rad."""
+        """Angle, rad, 0..pi, between the vehicle's upward axis and the world's, from the roll and
+        pitch of the newest telemetry."""
         tel = self.obs.telemetry
         up = math.cos(tel.roll_rad) * math.cos(tel.pitch_rad)
         return math.acos(max(-1.0, min(1.0, up)))
@@ -402,8 +409,9 @@ class Belief:
 
     @cached_property
     def climb_mps(self) -> float:
-        """Vertical speed, m/s: from the state estimate while it is valid, otherwise from the
-        accelerometer."""
+        """Vertical speed, m/s, positive upwards. It comes from the state estimate while the
+        position is valid. Otherwise, or once dead reckoning has replaced the estimate, it comes
+        from the accelerometer and drifts."""
         is_reckoned = self.dead_reckoning.imu is not None
         if is_reckoned and (
             self.dead_reckoning_began_at_s is not None or not self.is_position_valid
@@ -412,9 +420,11 @@ class Belief:
         return self.obs.telemetry.velocity_mps[2]
 
     def is_sinking(self, min_sink_mps: float) -> bool:
-        """True if the vehicle sinks faster than `min_sink_mps`.
+        """True if the vehicle sinks faster than `min_sink_mps` (positive), according to
+        `climb_mps`.
 
-        Without a valid position, the accelerometer must also read less than 1 g.
+        Without a valid position, the accelerometer must also read less than 1 g by more than
+        `perch.contact_acc_g`, because the dead-reckoned speed drifts.
         """
         if self.climb_mps >= -min_sink_mps:
             return False
@@ -463,7 +473,8 @@ class Belief:
 
     @cached_property
     def sighting_age_s(self) -> float:
-        """Seconds since the exposure of the last picture that shows the target."""
+        """Seconds since the exposure of the last picture that shows the target; infinite before the
+        first one."""
         return max(0.0, self.obs.t_s - self.dead_reckoning.last_sighting_at_s)
 
     @cached_property

@@ -246,7 +246,8 @@ def is_gear_certainly_in_magnet_reach(b: Belief) -> bool:
 
 
 def max_press_thrust(profile: Profile) -> float:
-    """Return the largest thrust that a press can reach, 0..65535."""
+    """Return the largest thrust that a press can reach, 0..65535: in a press by raw thrust, the
+    profile's `perch.thrust`, limited to `MAX_RAW_THRUST`; otherwise full thrust."""
     perch = profile.planner.perch
     return min(float(perch.thrust), MAX_RAW_THRUST) if perch.mode == "raw" else FULL_THRUST
 
@@ -305,7 +306,9 @@ def is_thrust_above_hover(b: Belief) -> bool:
 
 
 def is_pressing(b: Belief) -> bool:
-    """True if the thrust exceeds hover thrust and the vehicle does not move vertically."""
+    """True if the thrust exceeds hover thrust (`is_thrust_above_hover`), the estimated vertical
+    speed is at most `MAX_MOTIONLESS_CLIMB_RATE_MPS` in either direction, and the vehicle is too
+    high to stand on the ground."""
     return (
         is_thrust_above_hover(b)
         and abs(b.telemetry.velocity_mps[2]) <= MAX_MOTIONLESS_CLIMB_RATE_MPS
@@ -317,7 +320,10 @@ def is_pressing(b: Belief) -> bool:
 
 
 def is_slipping(b: Belief) -> bool:
-    """True if the vehicle falls away from the proven contact, by position or by acceleration."""
+    """True if the vehicle sinks faster than `complete.slip_mps` after a contact, and either its
+    estimated height is not above that of the contact (within
+    `MAX_HEIGHT_ESTIMATE_DRIFT_UP_DURING_SLIP_M`), or the accelerometer reads less than
+    `complete.slip_acc_g`, or the position is not valid. False if no contact is recorded."""
     complete, tel = b.profile.planner.complete, b.telemetry
     if b.vehicle_world_z_at_last_contact_m is None or not b.is_sinking(complete.slip_mps):
         return False
@@ -371,7 +377,9 @@ def _is_magnet_holding_vehicle(b: Belief) -> bool:
 
 
 def _is_hanging_with_motors_stopped(b: Belief) -> bool:
-    """True if the motors have stopped and the vehicle hangs where it made contact."""
+    """True if the vehicle hangs, with its motors stopped, where it made contact: the weight
+    transfer has begun, the reported thrust is at most `MAX_RAW_THRUST_WITH_MOTORS_STOPPED` (or is
+    unreliable), and the vehicle neither moves vertically nor slips."""
     return (
         b.command_history.weight_transfer_began_at_s is not None
         and (

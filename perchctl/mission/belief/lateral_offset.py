@@ -116,7 +116,15 @@ class LateralOffsetFilter:
     def with_picture_measurement(
         self, t_s: float, gear_to_target_world_xy_m: LateralVector, sigma_m: float
     ) -> LateralOffsetFilter:
-        """Return the filter after a picture exposed at `t_s` that measured the offset."""
+        """Return the filter, now valid at `t_s`, after a picture exposed at `t_s` that measured the
+        vector from the gear to the target (world x and y, m) with the standard deviation `sigma_m`
+        per axis.
+
+        A picture that is not newer than the last one changes nothing. After a gap of more than
+        `MAX_AGE_OF_NEWEST_PICTURE_S`, or if the normalized innovation squared exceeds
+        `MIN_NIS_TO_RESTART_FILTER`, the filter restarts at the measured vector with unknown
+        velocity.
+        """
         if t_s <= self.t_s:
             return self
         variance_m2 = max(sigma_m, MIN_MEASURED_OFFSET_SIGMA_M) ** 2
@@ -200,7 +208,9 @@ class LateralOffsetFilter:
         )
 
     def _propagate(self, t_s: float, acceleration_mps2: LateralVector) -> LateralOffsetFilter:
-        """Return the filter at `t_s` after a constant acceleration."""
+        """Return the filter at `t_s`, which is not before its own time, after the vehicle has
+        accelerated at the constant `acceleration_mps2` (world x and y) since then. The vector from
+        the gear to the target changes by minus the vehicle's motion."""
         dt_s = t_s - self.t_s
         density = ACCELERATION_NOISE_SIGMA_MPS2**2 * ACCELERATION_NOISE_CORRELATION_TIME_S
         p_ee, p_ev, p_vv = self.covariance

@@ -332,10 +332,24 @@ def _update_newest_impact(
 ) -> Impact:
     """Return the newest impact after one more sample.
 
-    An impact begins when the upward speed gained in it exceeds `MIN_FLOOR_IMPACT_SPEED_GAIN_MPS`.
-    The speeds before the impact are the lowest of `recent_samples`, since the onboard estimate
-    often includes the whole impact before it is detected. A bounce can only lower the speeds or
-    raise the peak of the old impact.
+    `newest_sample` holds the sample's time, its two climb rates (from the state estimate and from
+    the accelerometer) and its specific force along the body's z axis, but no height.
+    `recent_samples` holds such samples from the last `MAX_IMPACT_DETECTION_DELAY_S`, including
+    `newest_sample`. `world_z_m` is the estimated height of the vehicle at the newest sample.
+
+    An impact is detected while `upward_speed_gained_mps` exceeds `MIN_FLOOR_IMPACT_SPEED_GAIN_MPS`:
+
+    - More than `MAX_BOUNCE_TIME_AFTER_IMPACT_S` after `old`, a new impact replaces `old`. Its climb
+      rates before the impact are the lowest of `recent_samples`, because the onboard estimate often
+      includes the whole impact before it is detected. Climb rates are signed, so the lowest one is
+      the fastest descent. Its peak is the largest specific force of `recent_samples` along the
+      body's z axis, g.
+    - Up to that time, the detection is a bounce or the rest of the same impact and is merged into
+      `old`: it can only lower the climb rates and raise the peak. Time and height remain those of
+      `old`.
+
+    Without a detection, a sample up to that time after `old` can still raise the peak; later, `old`
+    is returned unchanged.
     """
     follows = newest_sample.t_s - old.t_s <= MAX_BOUNCE_TIME_AFTER_IMPACT_S
     if upward_speed_gained_mps > MIN_FLOOR_IMPACT_SPEED_GAIN_MPS:
@@ -379,7 +393,14 @@ class SteadySpeedDetector:
     mean_lateral_velocity_mps: tuple[float, float] = (0.0, 0.0)
 
     def update_steady_speed(self, t_s: float, velocity_mps: Vector, dt_s: float) -> Self:
-        """Return the detector after `dt_s`; `velocity_mps` is the newest velocity in world axes."""
+        """Return the detector at `t_s`, `dt_s` after its previous sample. `velocity_mps` is the
+        newest velocity in world axes, integrated from the accelerometer.
+
+        Each speed counts as constant from a start time, which is reset to `t_s` if the vertical
+        speed has changed by more than `MAX_STEADY_CLIMB_RATE_DEVIATION_MPS` since then, or if the
+        lateral velocity differs from its mean by more than
+        `MAX_STEADY_LATERAL_VELOCITY_DEVIATION_MPS`.
+        """
         x, y, z = velocity_mps
         climb_rate_became_steady_at_s, steady_climb_rate_mps = (
             self.climb_rate_became_steady_at_s,
@@ -416,8 +437,9 @@ class LateralPushDetector:
     def update_lateral_push(
         self, new: Telemetry, accelerometer_offset_g: Vector, dt_s: float
     ) -> Self:
-        """Return the detector after `dt_s`; `accelerometer_offset_g` is the accelerometer's offset
-        at rest."""
+        """Return the detector after the sample `new`, taken `dt_s` after the previous one.
+        `accelerometer_offset_g`, the accelerometer's offset at rest in body axes, is subtracted
+        from the sample's specific force."""
         keeps = math.exp(-dt_s / LATERAL_PUSH_TIME_CONSTANT_S)
         x_g, y_g = new.acc_x_g - accelerometer_offset_g[0], new.acc_y_g - accelerometer_offset_g[1]
         mean_x_g, mean_y_g = self.mean_specific_force_body_xy_g
@@ -444,9 +466,8 @@ class ImuMotion(
     event has not happened."""
 
     t_s: float = -math.inf  # time of the newest sample
-    velocity_since_first_sample_world_mps: Vector = (
-        ZERO_VECTOR  # velocity gained since the first sample, world axes
-    )
+    # velocity gained since the first sample, world axes
+    velocity_since_first_sample_world_mps: Vector = ZERO_VECTOR
     accelerometer_offset_g: Vector = ZERO_VECTOR  # offset of the accelerometer at rest, body axes
     last_telemetry_gap_ended_at_s: float = -math.inf  # end of the newest gap
     # end of the newest gap that may hide a fall
@@ -505,9 +526,13 @@ class ImuMotion(
         accelerometer_offset_g: Vector,
         roll_pitch_error_rad: tuple[float, float] = (0.0, 0.0),
     ) -> Vector:
-        """Return the acceleration in world axes from the specific force and attitude of a sample,
-        corrected for the accelerometer's offset and for the error of roll and pitch,
-        `roll_pitch_error_rad`."""
+        """Return the vehicle's acceleration (x, y, z) in world axes, m/s^2, without gravity: 0 in
+        hover and at rest.
+
+        It is the sample's specific force, minus `accelerometer_offset_g` (body axes), rotated by
+        the sample's attitude, whose roll and pitch are first reduced by `roll_pitch_error_rad`. An
+        attitude error that remains appears as a lateral acceleration of about 9.8 m/s^2 per rad.
+        """
         roll_rad, pitch_rad = (
             sample.roll_rad - roll_pitch_error_rad[0],
             sample.pitch_rad - roll_pitch_error_rad[1],

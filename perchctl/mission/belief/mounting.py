@@ -106,7 +106,7 @@ class CameraMountingMonitor:
 
     @property
     def is_camera_mounting_wrong(self) -> bool:
-        """True once enough successive sightings contradict the mounting."""
+        """True once `MIN_CONTRADICTING_SIGHTINGS` successive sightings contradict the mounting."""
         return self.contradicting_sighting_count >= MIN_CONTRADICTING_SIGHTINGS
 
     @property
@@ -119,7 +119,12 @@ class CameraMountingMonitor:
 def update_camera_mounting_monitor(
     old: CameraMountingMonitor, sample: CameraMountingSample
 ) -> CameraMountingMonitor:
-    """Return the monitor after one more frame that measured the target."""
+    """Return the monitor after one more frame that measured the target.
+
+    Once the mounting is confirmed or found wrong, nothing changes any more. After a jump of the
+    target or of the state estimate, the check starts again and pauses for `JUMP_PAUSE_S`. Sightings
+    older than `CAMERA_MOUNTING_CHECK_WINDOW_S` are dropped.
+    """
     if old.is_camera_mounting_confirmed or old.is_camera_mounting_wrong:
         return old
     kept = tuple(s for s in old.sightings if sample.t_s - s.t_s <= CAMERA_MOUNTING_CHECK_WINDOW_S)

@@ -25,7 +25,9 @@ NO_ESTIMATE_CORRECTION_TEXT = (
 
 
 def _does_estimate_contradict_imu(b: Belief) -> bool:
-    """True if the estimate follows motion-capture positions that contradict the accelerometer."""
+    """True if, with motion capture, the state estimate has recently gained more than
+    `MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS` of lateral velocity that the accelerometer has not
+    measured: the positions are then in wrong axes. Always False with another position source."""
     by_capture = b.profile.positioning.source.is_mocap
     return (
         by_capture

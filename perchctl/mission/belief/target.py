@@ -65,8 +65,9 @@ class TargetBelief:
 
     @property
     def is_far_above(self) -> bool:
-        """True if the target is so far above the gear that its magnet cannot be holding the
-        vehicle."""
+        """True if the target's world position is known and the target is more than
+        `MIN_GEAR_TO_TARGET_Z_TO_EXCLUDE_HANGING_M` above the gear, so that its magnet cannot be
+        holding the vehicle."""
         return (
             self.world_position_m is not None
             and self.gear_to_target_z_m > MIN_GEAR_TO_TARGET_Z_TO_EXCLUDE_HANGING_M
@@ -76,8 +77,9 @@ class TargetBelief:
     def from_estimate(
         cls, target: TargetEstimate | None, t_s: float, camera_latency_s: float, profile: Profile
     ) -> TargetBelief:
-        """Return the belief at `t_s` from the pipeline's estimate; `camera_latency_s` is the age of
-        a picture on arrival."""
+        """Return the belief at the loop time `t_s` from the pipeline's estimate; all values are
+        unknown if `target` is None. `camera_latency_s`, the age of a picture on arrival, is added
+        to the age up to which a measurement is fresh (`ascend.fresh_s`)."""
         if target is None:
             return cls()
         goal_z_m = math.inf
@@ -127,7 +129,12 @@ class VisualMotion:
         return self.t_s - self.detection_began_at_s >= MIN_DETECTION_TIME_TO_KNOW_VELOCITY_S
 
     def with_detection(self, target: TargetEstimate) -> VisualMotion:
-        """Return the motion after a frame that measured the target."""
+        """Return the motion after a frame that measured the target at `target.last_measured_at_s`.
+
+        A frame that is not newer than the last one changes nothing. After a gap of more than
+        `MAX_DETECTION_GAP_FOR_VELOCITY_S`, the velocity is unknown again. A step of the target
+        faster than `MAX_PLAUSIBLE_VISUAL_VELOCITY_MPS` changes the position but not the velocity.
+        """
         x_m, y_m, z_m = (float(v) for v in target.e_m)
         e_m, t_s = (x_m, y_m, z_m), target.last_measured_at_s
         dt_s = t_s - self.t_s

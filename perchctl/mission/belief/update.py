@@ -298,7 +298,13 @@ def _update_dead_reckoning(b: Belief) -> Belief:
 
 
 def _integrate_dead_reckoning(b: Belief) -> DeadReckoning:
-    """Integrate accelerometer and estimate, and learn biases from positions in free air."""
+    """Return the dead reckoning advanced by the newest sample of accelerometer and state estimate.
+
+    While the vehicle is in free air, the estimate is trusted and external positions still correct
+    its velocity, the bias of that velocity is learned as well; otherwise, the low-pass filters for
+    this bias restart. With a deck or motion capture, unexplained steps of a trusted position are
+    accumulated.
+    """
     obs, source = b.obs, b.profile.positioning.source
     is_estimate_trusted = (
         b.is_position_valid
@@ -368,8 +374,14 @@ def _zero_reckoned_velocity_at_contact(b: Belief, new: DeadReckoning) -> DeadRec
 
 
 def _adopt_visual_inertial_velocity(b: Belief, new: DeadReckoning) -> DeadReckoning:
-    """Adopt the velocity on which pictures and accelerometer agree, each time the visual-inertial
-    estimate (`VisualInertialMotion`) has a new one."""
+    """Return the dead reckoning `new` with the lateral velocity and acceleration bias (world axes)
+    of the visual-inertial estimate (`VisualInertialMotion`), on which pictures and accelerometer
+    agree. If that estimate is not newer than the sample at which the previous tick's dead reckoning
+    ended, `new` is returned unchanged.
+
+    The climb rate is adopted only if the pictures are known to be late, because late pictures also
+    make the estimated height wrong.
+    """
     motion, before = b.obs.visual_inertial_motion, b.dead_reckoning.imu
     if motion is None or not (before is None or motion.t_s > before.t_s):
         return new
@@ -484,7 +496,10 @@ def _climb_since_last_tick_m(b: Belief, new: DeadReckoning) -> float:
 
 
 def _update_estimators(b: Belief) -> Belief:
-    """Return the belief with its conditions, hover thrust, battery and mounting after the tick."""
+    """Return the belief, with `t_s` and `last_telemetry` of this tick, after the update of its
+    condition start times, hover thrust, rotor thrust, battery fit, mean thrust direction and camera
+    mounting. During a hold, only conditions that persist across phases keep their start times, and
+    the mounting is not checked."""
     obs, maneuver = b.obs, b.command_history.maneuver
     held = bool(hold_reason(b, maneuver))
     fresh = [each for each in BELIEF_CONDITIONS if is_evidence_fresh(b, each)]

@@ -78,7 +78,9 @@ def planned_hover_height_m(c: Context) -> float | None:
 
 
 def is_hover_height_unsafe(c: Context) -> bool:
-    """True if an aligned vehicle would hover near the ground, or at the height limit."""
+    """True if the vehicle is aligned and would hover lower than `MIN_HELD_SETPOINT_HEIGHT_M` above
+    the ground, or higher than `safety.max_height_m` minus `HOVER_HEIGHT_TOLERANCE_M`. False if the
+    mission does not hover."""
     height_m = planned_hover_height_m(c)
     if height_m is None or not is_aligned(c):
         return False

@@ -42,8 +42,9 @@ has moved or is covered. Smaller: a burst of lost pictures ends an attempt that 
 
 
 def ascent_cone_radius_m(c: Context) -> float:
-    """Return the radius of the cone at the present height, m: the largest offset from the target's
-    axis."""
+    """Return the radius of the approach cone at the gear's present height, m: the largest allowed
+    horizontal distance of the gear from the target's axis. It is `ascend.cone_base_m` at the target
+    and grows by `ascend.cone_slope` per metre below it."""
     ascend = c.planner.ascend
     return ascend.cone_base_m + ascend.cone_slope * max(0.0, c.belief.target.gear_to_target_z_m)
 
@@ -55,7 +56,8 @@ def ascent_end_distance_below_target_m(c: Context) -> float:
 
 
 def has_reached_ascent_end_height(c: Context) -> bool:
-    """True if the gear has reached the height at which the ascent settles."""
+    """True if the gear is at most `ascend.settle_z_m` below the height at which the ascent ends
+    (`ascent_end_distance_below_target_m`), or above it."""
     return (
         c.belief.target.gear_to_target_z_m
         <= ascent_end_distance_below_target_m(c) + c.planner.ascend.settle_z_m
@@ -113,8 +115,9 @@ def is_returning_to_hover_height(state: PlannerState) -> bool:
 
 
 def is_target_lost(c: Context) -> bool:
-    """True if the target has been out of view for too long. If the target itself is the positioning
-    system, any time without it is too long, since the position drifts."""
+    """True if the target is no longer tracked and was last seen more than
+    `MAX_TARGET_OUT_OF_VIEW_DURATION_S` ago. If the target itself is the positioning system, any
+    time without tracking is too long, since the position drifts."""
     b = c.belief
     patience_s = 0.0 if b.is_target_position_source else MAX_TARGET_OUT_OF_VIEW_DURATION_S
     return not b.target.is_tracked and b.target.age_s > patience_s

@@ -63,7 +63,8 @@ def time_since_motor_stop_command_s(c: Context) -> float:
 
 
 def is_hang_monitoring_over(c: Context) -> bool:
-    """True if the motors have been off for the whole monitoring time, `complete.watch_s`."""
+    """True if `complete.watch_s` has passed since the first command to stop the motors, and the
+    motors have been off for `MOTORS_OFF_DWELL_S`."""
     return (
         time_since_motor_stop_command_s(c) >= c.planner.complete.watch_s
         and c.true_for_s(MOTORS_OFF_AS_COMMANDED) >= MOTORS_OFF_DWELL_S

@@ -57,7 +57,7 @@ def act_in_perch(c: Context) -> Action:
 
 
 def is_contact_proven(c: Context) -> bool:
-    """True once a contact is proven."""
+    """True if the condition `TARGET_CONTACT` has been true for `perch.contact_dwell_s`."""
     return c.true_for_s(TARGET_CONTACT) >= c.planner.perch.contact_dwell_s
 
 

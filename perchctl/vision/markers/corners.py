@@ -93,8 +93,8 @@ def mean_side_px(corners_px: Array) -> float:
 
 
 def signed_double_area(corners: Array) -> Array:
-    """Return twice the area (m,) of m quadrilaterals with corners (m, 4, 2); positive if the
-    corners are clockwise."""
+    """Return twice the signed area (m,) of m quadrilaterals with corners (m, 4, 2), in squared
+    units of the corners; positive if the corners are clockwise in the image (x right, y down)."""
     a, b = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 

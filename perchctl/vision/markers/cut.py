@@ -118,9 +118,15 @@ def can_complete_marker_be_in_view(
 def fit_truncated_markers(
     detector_input: DetectorInput, expected_corners_px: Mapping[MarkerName, Array]
 ) -> dict[MarkerName, RefinedCorners]:
-    """Fit the pose of the target to its visible part, and return the corners of one marker,
-    projected from that pose; the result is empty if the fit fails. `expected_corners_px` are the
-    predicted corners of each marker, (4, 2) px."""
+    """Fit the pose of the target to its visible part, starting at `expected_corners_px`, the
+    predicted corners of each marker, (4, 2) px. Return the corners of one marker, projected from
+    the fitted pose: of the small marker if enough of its edge points were found, otherwise of the
+    large one.
+
+    The result is empty if the target has no small marker, if the small marker's cells are smaller
+    than `_MIN_SMALL_MARKER_CELL_PX`, or if the image does not match the target or does not
+    determine its position accurately enough.
+    """
     image, camera, patterns = (
         detector_input.image,
         detector_input.camera,
@@ -258,8 +264,10 @@ def _search_near_pose(
 
 
 def _is_pose_fit_reliable(pose_fit: PoseFit) -> bool:
-    """True if most of the visible edge points were found and if they determine the position
-    accurately."""
+    """True if at least `_MIN_FOUND_EDGE_POINT_FRACTION` of the visible edge points were found,
+    their RMS residual is below `_MAX_TRUNCATED_FIT_RESIDUAL_PX`, and the standard deviation of the
+    translation along its most uncertain direction is below `_MAX_CENTRE_SIGMA_HALF_SIDES` (half
+    sides of the large marker)."""
     spread = math.sqrt(
         max(float(np.linalg.eigvalsh(pose_fit.rotation_translation_cov[3:, 3:])[-1]), 0.0)
     )
@@ -751,8 +759,13 @@ def fit_pose(
     camera: CameraModel,
     hidden_mask_u8: NDArray[np.uint8] | None = None,
 ) -> PoseFit | None:
-    """Fit the pose at which the projected edges of the drawing match the edges in the image; None
-    if the fit fails."""
+    """Fit the pose of the drawing in the camera frame by Gauss-Newton steps from `start`, so that
+    the projected edges of `outline` match the edges in the image. Pixels at which `hidden_mask_u8`
+    (h, w) is not zero are not used.
+
+    Returns None if fewer than `_MIN_EDGE_POINTS` edge points are in view or found, or if the fit
+    does not converge; the result may still be unreliable (`_is_pose_fit_reliable`).
+    """
     pose, pose_and_edge_shift_change_from_start, fit_step, moved_px = (
         start,
         np.zeros(7),

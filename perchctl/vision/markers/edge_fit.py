@@ -549,9 +549,8 @@ def _row_jitter_sigma_px(
 # more rows.
 
 
-_MIN_CELL_TO_MEASURE_EDGE_SHIFT_PX = (
-    6.0  # with smaller cells, the border's inner edge is not measured
-)
+# With smaller cells, the border's inner edge is not measured.
+_MIN_CELL_TO_MEASURE_EDGE_SHIFT_PX = 6.0
 _SIDE_INDICES = np.arange(4)[:, None]
 
 

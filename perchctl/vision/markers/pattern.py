@@ -139,7 +139,10 @@ def make_marker_pattern(
 
 
 def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern) -> bool:
-    """True if every cell in the image clearly has the colour of its cell in the pattern."""
+    """True if every cell of a marker with corners (4, 2) px clearly has the colour of its cell in
+    the pattern: its mean grey is on the right side of the middle between the medians of black and
+    white, by at least `MIN_CELL_MARGIN_TO_CONTRAST_RATIO` of the contrast. False if the contrast is
+    below `MIN_CONTRAST_GREY` or the marker is partly outside the image."""
     means = _mean_grey_per_cell(image, corners_px, pattern)
     if means is None:
         return False
@@ -172,7 +175,8 @@ def has_mostly_matching_cells(
 def is_correlated_with_pattern(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> bool:
-    """True if the grey values in the cells correlate clearly with the pattern."""
+    """True if the grey values in the cells of a marker with corners (4, 2) px, without rotation of
+    the marker, have a correlation of more than `_MIN_PATTERN_CORRELATION` with the pattern."""
     return (
         float(correlate_pattern_rotations(image, corners_px, pattern)[0]) > _MIN_PATTERN_CORRELATION
     )
