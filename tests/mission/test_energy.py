@@ -21,7 +21,7 @@ from perchctl.mission.belief.battery import (
     update_battery_fit,
 )
 from perchctl.mission.context import Context
-from perchctl.mission.endurance import compute_battery_outlook, predict_hover_time_s
+from perchctl.mission.endurance import compute_battery_outlook, predict_hover_times
 from perchctl.profile import Profile
 from perchctl.sim import CONTROL_PERIOD_S
 from perchctl.sim.powertrain import Cell
@@ -45,7 +45,7 @@ BRUSHLESS_MAH = 350.0
 LOW_V = 3.2  # below it, the firmware reports low power after `FIRMWARE_LOW_POWER_REPORT_DELAY_S`
 FIRMWARE_LOW_POWER_REPORT_DELAY_S = 5.0
 HOVER = HOVER_THRUST / FULL_THRUST
-ATTEMPT_S, EXPECTED_LANDING_DURATION_BEYOND_DESCENT_S = 12.0, 10.0
+ATTEMPT_S, LANDING_S = 12.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -77,12 +77,15 @@ def hovering(
         )
 
 
-def end_of_hover_s(moments: list[Moment], low_v: float = LOW_V) -> float:
+def time_below_s(moments: list[Moment], load_v: float) -> float:
+    """When the voltage in hover falls below `load_v`, s; infinite if it does not."""
+    return next((m.t_s for m in moments if m.t_s > 1.0 and m.under_load_v < load_v), math.inf)
+
+
+def time_of_battery_low_s(moments: list[Moment], low_v: float = LOW_V) -> float:
     """When row `battery-low` applies: the firmware reports low power, or the least voltage."""
-    low_s = next(m.t_s for m in moments if m.t_s > 1.0 and m.under_load_v < low_v)
-    least_v = PROFILE.safety.min_load_v
-    ends_s = (m.t_s for m in moments if m.t_s > 1.0 and m.under_load_v < least_v)
-    return min(low_s + FIRMWARE_LOW_POWER_REPORT_DELAY_S, next(ends_s, math.inf))
+    low_power_s = time_below_s(moments, low_v) + FIRMWARE_LOW_POWER_REPORT_DELAY_S
+    return min(low_power_s, time_below_s(moments, PROFILE.safety.min_load_v))
 
 
 WEAK = {
@@ -107,28 +110,22 @@ WEAK = {
 def test_what_is_left_is_not_more_than_there_is(name: str, hover: float) -> None:
     """From a few seconds on, where it decides."""
     moments = list(hovering(*WEAK[name], most_s=130.0, hover=hover))
-    end_s = end_of_hover_s(moments)
-    assert 20.0 < end_s < 130.0
+    low_s = time_of_battery_low_s(moments)
+    least_v_s = time_below_s(moments, PROFILE.safety.min_load_v)
+    assert 20.0 < low_s < 130.0
     for moment in moments[:: round(1.0 / PERIOD_S)]:
-        ahead_s = end_s - moment.t_s
-        if moment.t_s < 6.0 or ahead_s <= 0.0:
+        if moment.t_s < 6.0 or moment.t_s >= low_s:
             continue
-        told_s = predict_hover_time_s(moment.energy, PROFILE, hover, BRUSHED_POWER_TRAIN)
-        assert told_s is not None
-        if ahead_s < ATTEMPT_S:  # an attempt that is lost in its ascent is not begun
-            assert (
-                told_s
-                < ATTEMPT_S
-                + EXPECTED_LANDING_DURATION_BEYOND_DESCENT_S
-                + PROFILE.safety.energy_reserve_s
-            )
-        if ahead_s > 70.0:  # and one that is safe three times over is
-            assert (
-                told_s
-                > ATTEMPT_S
-                + EXPECTED_LANDING_DURATION_BEYOND_DESCENT_S
-                + PROFILE.safety.energy_reserve_s
-            )
+        times = predict_hover_times(moment.energy, PROFILE, hover, BRUSHED_POWER_TRAIN)
+        assert times is not None
+        reserve_s = PROFILE.safety.energy_reserve_s
+        begins = times.until_landing_must_begin_s(LANDING_S, reserve_s) >= ATTEMPT_S
+        if low_s - moment.t_s < ATTEMPT_S:  # the attempt would be lost in its ascent
+            assert not begins
+        if least_v_s - moment.t_s < ATTEMPT_S + LANDING_S:  # the landing would be a fall
+            assert not begins
+        if low_s - moment.t_s > 70.0:  # three times the time that it takes
+            assert begins
 
 
 @pytest.mark.parametrize("rest_v", [3.9, pytest.param(3.95, marks=pytest.mark.long)])
@@ -137,7 +134,7 @@ def test_a_brushless_vehicle_has_no_more_left_than_until_its_own_low_power(rest_
     cell = {"ohm": 0.143 * MAH / BRUSHLESS_MAH, "charge": BRUSHLESS_MAH / MAH}
     profile, hover, low_v = changed({"vehicle.battery_mah": BRUSHLESS_MAH}), 0.55, 3.35
     moments = list(hovering(rest_v, cell, 200.0, hover, BRUSHLESS_POWER_TRAIN, BRUSHLESS_MAH))
-    end_s = end_of_hover_s(moments, low_v)
+    end_s = time_of_battery_low_s(moments, low_v)
     for moment in moments[round(20.0 / PERIOD_S) : round(end_s / PERIOD_S) : 50]:
         obs = at(thrust=hover * FULL_THRUST, supervisor=AIRBORNE & ~AUTO_ARM)(moment.t_s)
         state = remembering(state_in(Phase.ALIGN), battery_fit=moment.energy, hover_thrust=0.0)
@@ -154,8 +151,26 @@ def test_the_firmware_reports_low_power_only_after_its_delay(hover: float) -> No
     at_least_v = replace(FINE_BATTERY, rest_v=PROFILE.safety.min_load_v + sag_v)
     for energy, expected_s in ((at_limit, FIRMWARE_LOW_POWER_REPORT_DELAY_S), (at_least_v, 0.0)):
         hovers = changed({"planner.hover": {"below_m": 0.5, "duration_s": 1.0}})  # no press
-        left_s = predict_hover_time_s(energy, hovers, hover, BRUSHED_POWER_TRAIN)
-        assert left_s == pytest.approx(expected_s)
+        times = predict_hover_times(energy, hovers, hover, BRUSHED_POWER_TRAIN)
+        assert times is not None
+        assert times.until_battery_low_s == pytest.approx(expected_s)
+
+
+@given(st.floats(0.4, 0.8), st.floats(3.3, 4.1), st.floats(0.0, 60.0), st.floats(0.0, 9.0))
+def test_a_landing_that_has_begun_goes_on_after_low_power(
+    hover: float, rest_v: float, landing_s: float, reserve_s: float
+) -> None:
+    """Low power lands the vehicle, but stops no motor: only the least voltage ends a landing."""
+    times = predict_hover_times(
+        replace(FINE_BATTERY, rest_v=rest_v), PROFILE, hover, BRUSHED_POWER_TRAIN
+    )
+    assert times is not None
+    assert 0.0 <= times.until_battery_low_s <= times.until_min_load_v_s
+    time_left_s = times.until_landing_must_begin_s(landing_s, reserve_s)
+    assert time_left_s <= times.until_battery_low_s
+    assert time_left_s + landing_s + reserve_s <= max(times.until_min_load_v_s, 0.0) + 1e-9
+    no_landing_s = times.until_landing_must_begin_s(0.0, 0.0)
+    assert no_landing_s - landing_s - reserve_s <= time_left_s + 1e-9
 
 
 def used_up(energy: BatteryFit, volts: float, thrust: float, lasts_s: float) -> BatteryFit:
@@ -168,7 +183,7 @@ def used_up(energy: BatteryFit, volts: float, thrust: float, lasts_s: float) -> 
 @pytest.mark.parametrize("reading_v", [0.0, 0.3, math.nan, math.inf, -math.inf, 4.41, 8.38])
 def test_without_a_reading_nothing_is_known(reading_v: float) -> None:
     energy = used_up(used_up(BatteryFit(), reading_v, 0.0, 1.0), reading_v, HOVER_THRUST, 9.0)
-    assert predict_hover_time_s(energy, PROFILE, HOVER, BRUSHED_POWER_TRAIN) is None
+    assert predict_hover_times(energy, PROFILE, HOVER, BRUSHED_POWER_TRAIN) is None
     assert energy.time_since_battery_reading_s == pytest.approx(10.0)
 
 
@@ -186,9 +201,9 @@ def test_no_reading_breaks_it(readings: list[tuple[float, float]]) -> None:
     energy = FINE_BATTERY
     for volts, thrust in readings:
         energy = update_battery_fit(energy, PERIOD_S, volts, thrust, MAH, BRUSHED_POWER_TRAIN)
-    seconds = predict_hover_time_s(energy, PROFILE, HOVER, BRUSHED_POWER_TRAIN)
-    assert seconds is not None
-    assert 0.0 <= seconds < 1e5
+    times = predict_hover_times(energy, PROFILE, HOVER, BRUSHED_POWER_TRAIN)
+    assert times is not None
+    assert 0.0 <= times.until_battery_low_s < 1e5
 
 
 # --- the gate ------------------------------------------------------------------------------
@@ -253,6 +268,15 @@ def test_a_reading_that_stands_still_is_none() -> None:
         assert (compute_battery_outlook(Context(state)).hover_time_left_s is not None) is known
 
 
+def test_a_battery_at_rest_is_known_although_its_reading_stands_still() -> None:
+    """Without the resting voltage, a large sag looks like a small charge."""
+    for thrust, known_v in ((0.0, 4.12), (HOVER_THRUST, None)):
+        obs = replace(at(battery_v=4.12, thrust=thrust)(10.02), battery_reading_age_s=20.0)
+        before = remembering(state_in(Phase.APPROACH), battery_fit=BatteryFit())
+        state = observing(before, obs)
+        assert state.belief.battery_fit.takeoff_rest_v == known_v
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -265,8 +289,8 @@ def test_a_reading_that_stands_still_is_none() -> None:
 )
 def test_a_flight_ends_sooner_where_battery_low_fires_sooner(changes: dict[str, Any]) -> None:
     energy = replace(FINE_BATTERY, rest_v=3.95)
-    usual_s = predict_hover_time_s(energy, PROFILE, 0.5, BRUSHED_POWER_TRAIN)
-    sooner_s = predict_hover_time_s(energy, changed(changes), 0.5, BRUSHED_POWER_TRAIN)
-    assert usual_s is not None
-    assert sooner_s is not None
-    assert 0.0 < sooner_s < usual_s
+    usual = predict_hover_times(energy, PROFILE, 0.5, BRUSHED_POWER_TRAIN)
+    sooner = predict_hover_times(energy, changed(changes), 0.5, BRUSHED_POWER_TRAIN)
+    assert usual is not None
+    assert sooner is not None
+    assert 0.0 < sooner.until_battery_low_s < usual.until_battery_low_s

@@ -191,10 +191,14 @@ def update_battery_fit_from_telemetry(
     """Return the fit `dt_s` later, in a tick whose newest sample is `telemetry`, for a battery with
     the full charge `battery_capacity_mah`.
 
-    `reading_age_s` is the age of the sample's battery voltage; a reading older than
-    `MAX_BATTERY_READING_AGE_S` counts as missing (see `update_battery_fit`).
+    `reading_age_s` is the time since the voltage last changed. After `MAX_BATTERY_READING_AGE_S`, a
+    reading counts as missing (see `update_battery_fit`), unless the motors have not turned yet: a
+    battery at rest keeps its voltage, and without this resting voltage the fit cannot tell a large
+    sag from a small charge.
     """
-    reading_v = telemetry.battery_v if reading_age_s <= MAX_BATTERY_READING_AGE_S else math.nan
+    is_resting = telemetry.thrust == 0.0 and not old.time_under_load_s
+    is_current = reading_age_s <= MAX_BATTERY_READING_AGE_S
+    reading_v = telemetry.battery_v if is_current or is_resting else math.nan
     power_train = identify_power_train(telemetry)
     return update_battery_fit(
         old, dt_s, reading_v, telemetry.thrust, battery_capacity_mah, power_train
