@@ -34,6 +34,12 @@ from perchctl.vision import (
 GROUND_FRAMES = 15
 """Number of frames at rest whose median gives the target's position: half a second with a 30 Hz
 camera."""
+SETTLED_TILT_RAD = 0.003
+"""Largest difference between the attitudes of these frames, rad: 6 mm at 2 m. Larger: a target that
+is seen while the estimator still corrects its attitude is learned in the wrong place. Smaller: the
+noise of the attitude delays a take-off."""
+SETTLED_POSITION_M = 0.02
+"""Largest difference between the estimated positions of these frames, m."""
 OLDEST_S = 0.3
 """Age at which a sighting is no longer sent, s."""
 GATE_M, GATE_MPS, GATE_SIGMAS = 0.10, 0.35, 5.0
@@ -73,6 +79,13 @@ def body_place(pose: MarkerPose, attitude: VehicleState, target: Place, setup: P
     return Place(target.position_m - rot_z(yaw_rad).dot(way_m), yaw_rad)
 
 
+def _is_settled(earlier: VehicleState, now: VehicleState) -> bool:
+    """True if the estimate of a vehicle at rest has not changed beyond its noise."""
+    tilt_rad = math.hypot(now.roll_rad - earlier.roll_rad, now.pitch_rad - earlier.pitch_rad)
+    moved_m = math.dist(now.position_m, earlier.position_m)
+    return tilt_rad <= SETTLED_TILT_RAD and moved_m <= SETTLED_POSITION_M
+
+
 class TargetFeed:
     """Sends the vehicle's position, measured from sightings of the target. Called from the flight
     loop's thread.
@@ -89,7 +102,7 @@ class TargetFeed:
         self._rate = SendingRate(self._config.rate_hz)
         self.target: Place | None = None
         self.off = NOWHERE
-        self._on_ground: list[Place] = []
+        self._on_ground: list[tuple[VehicleState, Place]] = []
         self._seen_s = -math.inf
         self._placed_s = -math.inf
         self._pose: ExternalPosition | None = None
@@ -196,12 +209,17 @@ class TargetFeed:
         return ""
 
     def _learn_place(self, pose: MarkerPose, then: VehicleState) -> None:
-        self._on_ground.append(target_place(pose, then, self._setup))
+        """Learn the target's position from the frames since the estimate has settled. The first
+        external positions correct an estimate that has drifted without any, which tilts its
+        attitude for about a second."""
+        settled = [each for each in self._on_ground if _is_settled(each[0], then)]
+        self._on_ground = [*settled, (then, target_place(pose, then, self._setup))]
         if len(self._on_ground) < GROUND_FRAMES:
             return
-        first_rad = self._on_ground[0].yaw_rad
-        turns_rad = [wrap_rad(place.yaw_rad - first_rad) for place in self._on_ground]
-        position_m = np.median([place.position_m for place in self._on_ground], axis=0)
+        places = [place for _, place in self._on_ground]
+        first_rad = places[0].yaw_rad
+        turns_rad = [wrap_rad(place.yaw_rad - first_rad) for place in places]
+        position_m = np.median([place.position_m for place in places], axis=0)
         self.target = Place(position_m, wrap_rad(first_rad + float(np.median(turns_rad))))
 
     def _learn_off(self, pose: MarkerPose, place: Place, then: VehicleState) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -132,6 +133,27 @@ def test_a_place_is_measured_at_rest_only_and_by_the_median() -> None:
         shown(it, at, at.t_s, pose=seen(TARGET if i else false, at))
     assert it.target is not None
     np.testing.assert_allclose(it.target.position_m, TARGET.position_m, atol=1e-9)
+
+
+@given(roll_rad=st.floats(-0.02, 0.02), pitch_rad=st.floats(-0.02, 0.02), drift_m=within)
+def test_a_place_is_learned_only_after_the_estimate_has_settled(
+    roll_rad: float, pitch_rad: float, drift_m: float
+) -> None:
+    """The first positions correct an estimate that has drifted: its attitude turns for a while."""
+    it = feed(Sent())
+    for i in range(6 * GROUND_FRAMES):
+        t_s = i * FRAME_S
+        true = attitude(t_s)
+        wrong = math.exp(-t_s / 0.3)
+        believed = replace(
+            true,
+            roll_rad=true.roll_rad + wrong * roll_rad,
+            pitch_rad=true.pitch_rad + wrong * pitch_rad,
+            position_m=(wrong * drift_m, 0.0, 0.0),
+        )
+        shown(it, true, t_s, believed)
+    assert it.target is not None
+    assert math.dist(it.target.position_m, TARGET.position_m) < 0.025
 
 
 # --- in the air --------------------------------------------------------------------------
