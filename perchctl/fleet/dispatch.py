@@ -286,8 +286,8 @@ def find_obstacle(plan: FleetPlan, name: str, ended: Mapping[str, Result]) -> st
 
 
 def is_at_home(vehicle: FleetVehicle, result: Result) -> bool:
-    """True if a vehicle whose flight has ended is known to stand where it took off. An estimate
-    that starts at zero drifts, so it cannot show where the vehicle stands."""
+    """True if a vehicle whose flight has ended is known to be on the floor where it took
+    off. An estimate that starts at zero drifts, so it cannot show where the vehicle is."""
     if not result.has_flown:
         return True
     if result.hangs or vehicle.frame != "room" or result.place_m is None:

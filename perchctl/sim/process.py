@@ -42,8 +42,9 @@ class SimProcess:
         uri: address for cflib.
         stream_url: address of the video; "" without a camera.
         capture: the motion-capture system's kind and address for `motioncapture`, or None.
-        shared_time: how far simulated time has advanced in real time, and how far it may advance.
-        pid: process number of the child.
+        shared_time: in real time, the simulated time reached so far and the time up to which the
+            simulation may run.
+        pid: process ID of the child.
     """
 
     uri = stream_url = ""

@@ -526,10 +526,10 @@ _PREVIOUS_CORNER_INDICES = np.array([3, 0, 1, 2])
 # Side k runs from corner k to corner k + 1.
 _SIDE_START_CORNER_INDICES = np.arange(4)
 _SIDE_END_CORNER_INDICES = np.array([1, 2, 3, 0])
-_SIDE_WHITENING_ROWS = np.concatenate(
+_SIDE_WHITENING_MATRIX_ROW_INDICES = np.concatenate(
     [2 * np.tile(_SIDE_START_CORNER_INDICES, 4), 2 * np.tile(_SIDE_START_CORNER_INDICES, 4) + 1]
 )
-_SIDE_WHITENING_COLUMNS = np.concatenate(
+_SIDE_WHITENING_MATRIX_COLUMN_INDICES = np.concatenate(
     [
         2 * _SIDE_START_CORNER_INDICES,
         2 * _SIDE_START_CORNER_INDICES + 1,
@@ -539,7 +539,9 @@ _SIDE_WHITENING_COLUMNS = np.concatenate(
     * 2
 )
 # Indices into a flattened (8, 8) matrix.
-_SIDE_WHITENING_FLAT_INDICES = 8 * _SIDE_WHITENING_ROWS + _SIDE_WHITENING_COLUMNS
+_SIDE_WHITENING_FLAT_INDICES = (
+    8 * _SIDE_WHITENING_MATRIX_ROW_INDICES + _SIDE_WHITENING_MATRIX_COLUMN_INDICES
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -295,7 +295,8 @@ class MarkerTrack:
 
     @property
     def state_cov_with_biases(self) -> Array:
-        """Covariance (8, 8) of the state, including the biases."""
+        """Covariance (8, 8) of the state `x` (yaw, yaw rate, then position and velocity of x, y, z;
+        SI), including the four biases: the vehicle's roll and pitch, the print's size and curl."""
         return self.P + self.state_shift_per_bias_sigma @ self.state_shift_per_bias_sigma.T
 
 
