@@ -21,14 +21,23 @@ from pathlib import Path
 from perchctl.errors import InvalidValue
 
 FORMAT = "the output file"
+RECORDING, ROS_BAG = "a recording", "a ROS bag"
+SQLITE = "an SQLite database, as in a ROS bag"
 _BEGINNINGS = (
     (b"\x89PNG", "a picture"),
     (b"\xff\xd8\xff", "a picture"),
     (b"%PDF", "a PDF"),
-    (b"\x89MCAP0", "a recording"),
+    (b"#ROSBAG V", ROS_BAG),
+    (b"SQLite format 3\0", SQLITE),
     (b'{"kind":"header","format":"perchctl-flight-log"', "a flight log"),
 )
+_MCAP = b"\x89MCAP0\r\n"
+_MCAP_PROFILE = slice(21, 25)
+"""The profile's name in an MCAP file's header, after the magic bytes (8), the record's type (1) and
+length (8), and the length of the name (4)."""
+_BAG_METADATA = "metadata.yaml"
 _KEYS = (  # keys at the beginning of a line, by which a YAML file is recognised
+    (r"rosbag2_bagfile_information", ROS_BAG),
     (r"image_width|camera_matrix|distortion_model|cam0", "a camera calibration"),
     (r"vehicles", "a fleet file"),
     (r"extends|vehicle|planner|safety|positioning", "a profile"),
@@ -39,16 +48,23 @@ _UNKNOWN = "another kind of file"
 
 def file_kind(path: Path) -> str:
     """Return what kind of file this seems to be, such as ``a picture``; ``another kind of file`` if
-    unknown.
+    unknown. A folder is only recognised if it is a ROS 2 bag, by its ``metadata.yaml``.
 
     For messages about a file of the wrong kind; never raises.
     """
     with suppress(OSError, ValueError):
+        if path.is_dir():
+            is_bag = file_kind(path / _BAG_METADATA) == ROS_BAG
+            return ROS_BAG if is_bag else _UNKNOWN
+        if not path.is_file():  # reading a pipe would take its data away
+            return _UNKNOWN
         with path.open("rb") as stream:
             head = stream.read(_READ_BYTES)
         for beginning, kind in _BEGINNINGS:
             if head.startswith(beginning):
                 return kind
+        if head.startswith(_MCAP):
+            return ROS_BAG if head[_MCAP_PROFILE] in (b"ros1", b"ros2") else RECORDING
         if head[4:8] == b"ftyp":
             return "a video"
         text = head.decode("utf-8", errors="ignore")

@@ -117,6 +117,12 @@ def test_what_is_not_for_all_is_for_nobody_else_before_it_is_whole(
         (b"# mine\nextends: sim\n", "a profile"),
         (b"name: four\nvehicles:\n", "a fleet file"),
         (b'{"kind":"header","format":"perchctl-flight-log","version":3}\n', "a flight log"),
+        (b"\x89MCAP0\r\n\x01\x12" + bytes(11) + b"\x0a\0\0\0perchctl 1", "a recording"),
+        (b"\x89MCAP0\r\n\x01\x15" + bytes(7) + b"\x04\0\0\0ros2", "a ROS bag"),
+        (b"\x89MCAP0\r\n", "a recording"),
+        (b"#ROSBAG V2.0\n", "a ROS bag"),
+        (b"rosbag2_bagfile_information:\n  version: 9\n", "a ROS bag"),
+        (b"SQLite format 3\0", "an SQLite database, as in a ROS bag"),
         (b"", "another kind of file"),
     ],
 )
@@ -125,6 +131,26 @@ def test_a_file_is_named_by_its_content(content: bytes, kind: str, tmp_path: Pat
     file.write_bytes(content)
     assert file_kind(file) == kind
     assert file_kind(tmp_path) == file_kind(tmp_path / "none") == "another kind of file"
+
+
+def test_a_folder_is_only_named_if_it_is_a_bag(tmp_path: Path) -> None:
+    metadata = tmp_path / "metadata.yaml"
+    for text, kind in (
+        ("extends: sim\n", "another kind of file"),
+        ("rosbag2_bagfile_information:\n  version: 9\n", "a ROS bag"),
+    ):
+        metadata.write_text(text)
+        assert file_kind(tmp_path) == kind
+
+
+def test_a_pipe_keeps_its_data(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with open(os.open(pipe, os.O_RDWR), "r+b", buffering=0) as stream:
+        stream.write(b"%PDF-1.7")
+        os.set_blocking(stream.fileno(), False)
+        assert file_kind(pipe) == "another kind of file"
+        assert stream.read(100) == b"%PDF-1.7"
 
 
 @pytest.mark.parametrize(

@@ -14,10 +14,35 @@ from numpy.typing import NDArray
 from perchctl.camera.jpeg import decode_grey, jpeg_end_and_size
 from perchctl.camera.source import without_password
 from perchctl.errors import InvalidValue, NotFound
+from perchctl.files import RECORDING, ROS_BAG, SQLITE, file_kind, kind_note
 from perchctl.vision import Frame, to_grey
 
 DEFAULT_RATE_HZ = 30.0
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp"})
+
+_EXPORT_BAG = (
+    "export its images to a folder, or play the bag and name the http:// stream of its images "
+    "(docs/tracking.md)"
+)
+_ADVICE = {
+    RECORDING: "write the images of a perchctl recording to a folder first "
+    "(docs/after-a-flight.md), and name the folder",
+    ROS_BAG: _EXPORT_BAG,
+    SQLITE: _EXPORT_BAG,
+}
+"""How to get at the images in a file that contains some, but is neither a picture nor a video."""
+
+
+def refuse_other_kinds(path: Path) -> None:
+    """Raise InvalidValue if the content of a file shows that it is neither a picture nor a video,
+    or if a folder is a ROS bag.
+
+    FFmpeg would search a recording or bag for JPEGs, and play what it takes for frames: pieces of
+    images, with times that nobody measured.
+    """
+    if note := kind_note(path, "a picture", "a video"):
+        shown, advice = without_password(str(path)), _ADVICE.get(file_kind(path), "")
+        raise InvalidValue(f"{shown} is neither a picture nor a video{note}", advice)
 
 
 class RecordedSource:
@@ -76,6 +101,7 @@ class VideoSource(RecordedSource):
     computed from the frame rate."""
 
     def __init__(self, path: Path, latency_s: float = 0.0) -> None:
+        refuse_other_kinds(path)
         if not path.is_file():
             raise NotFound(f"video file {without_password(str(path))} was not found")
         # perchctl reports errors itself, in one sentence, so OpenCV must not print anything
@@ -156,11 +182,12 @@ def decode_picture(data: bytes) -> NDArray[np.uint8]:
 
 def image_files(where: str | Sequence[Path]) -> list[Path]:
     """Return the files given by a folder, glob or list, without duplicates, in natural order.
-    Raises NotFound."""
+    Errors: NotFound, InvalidValue."""
     if not isinstance(where, str):
         return sorted(set(where), key=_natural)
     folder = Path(where)
     if folder.is_file():
+        refuse_other_kinds(folder)
         found = [folder]
     elif folder.is_dir():
         found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
@@ -171,6 +198,7 @@ def image_files(where: str | Sequence[Path]) -> list[Path]:
             shown = without_password(where)
             raise NotFound(f"{shown} is neither a folder nor a pattern that matches pictures")
     if not found:
+        refuse_other_kinds(folder)
         allowed = " ".join(sorted(IMAGE_SUFFIXES))
         raise NotFound(f"folder {where} contains no pictures ({allowed})")
     return sorted(found, key=_natural)

@@ -11,7 +11,13 @@ from urllib.parse import urlsplit
 
 from perchctl.camera.aideck import AiDeckSource
 from perchctl.camera.device import DeviceSource, camera_number, open_video_capture
-from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource, VideoSource
+from perchctl.camera.files import (
+    DEFAULT_RATE_HZ,
+    IMAGE_SUFFIXES,
+    ImagesSource,
+    VideoSource,
+    refuse_other_kinds,
+)
 from perchctl.camera.network import MjpegSource, RtspSource
 from perchctl.camera.source import (
     Clock,
@@ -24,7 +30,6 @@ from perchctl.camera.source import (
 )
 from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.extensions import is_extension, make_extension
-from perchctl.files import kind_note
 from perchctl.profile import CameraConfig
 
 REAL = (
@@ -96,8 +101,7 @@ def parse_source(text: str) -> SourceName:
     if path.is_dir() or any(c in text for c in "*?["):
         return SourceName("images", text)
     if path.is_file():
-        if note := kind_note(path, "a picture", "a video"):
-            raise InvalidValue(f"{shown} is neither a picture nor a video{note}")
+        refuse_other_kinds(path)
         return SourceName("images" if path.suffix.lower() in IMAGE_SUFFIXES else "video", text)
     if is_extension(text):
         return SourceName(scheme, place)

@@ -178,6 +178,56 @@ def test_videos_that_are_none(tmp_path: Path, capfd: pytest.CaptureFixture[str])
     assert capfd.readouterr().err == ""
 
 
+MCAP = b"\x89MCAP0\r\n\x01"
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "sentence"),
+    [
+        (
+            "flight.mcap",
+            MCAP + b"\x12" + bytes(11) + b"\x0a\0\0\0perchctl 1",
+            "(it is a recording); write the images of a perchctl recording to a folder first",
+        ),
+        (
+            "bag_0.mcap",
+            MCAP + b"\x15" + bytes(7) + b"\x04\0\0\0ros2",
+            "(it is a ROS bag); export its images to a folder, or play the bag",
+        ),
+        ("lab.bag", b"#ROSBAG V2.0\n", "(it is a ROS bag); export its images"),
+        (
+            "bag_0.db3",
+            b"SQLite format 3\0",
+            "(it is an SQLite database, as in a ROS bag); export its images",
+        ),
+    ],
+)
+def test_the_jpegs_in_a_recording_or_bag_are_not_played_as_a_video(
+    name: str, head: bytes, sentence: str, tmp_path: Path
+) -> None:
+    """FFmpeg would find them, but neither their times nor all of their ends."""
+    image = np.random.default_rng(0).integers(0, 255, (90, 120), np.uint8)
+    path, jpeg = tmp_path / name, cv2.imencode(".jpg", image)[1].tobytes()
+    for number, before in enumerate((b"", head)):
+        path.write_bytes(before + b"".join(bytes(50) + jpeg for _ in range(30)))
+        if not number:
+            assert len(drain(open_camera(f"video:{path}", CLOCK))) > 1
+            continue
+        for scheme in ("video:", "images:", ""):
+            with pytest.raises(InvalidValue) as refused:
+                open_camera(f"{scheme}{path}", CLOCK)
+            assert f"{name} is neither a picture nor a video {sentence}" in str(refused.value)
+
+
+def test_the_folder_of_a_bag_is_no_folder_of_pictures(tmp_path: Path) -> None:
+    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information:\n  version: 9\n")
+    for scheme in ("video:", "images:", ""):
+        with pytest.raises(InvalidValue, match=r"is a ROS bag.*; export its images to a folder"):
+            open_camera(f"{scheme}{tmp_path}", CLOCK)
+    write_images(tmp_path, 2)
+    assert len(drain(open_camera(str(tmp_path), CLOCK))) == 2
+
+
 def test_a_picture_that_is_cut_off_is_named_before_a_decoder_speaks_of_it(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
