@@ -59,14 +59,14 @@ def node(patch: pytest.MonkeyPatch, port: int) -> tuple[Ros2, ModuleType]:
 
 
 def published(
-    node: tuple[Ros2, ModuleType], port: int, *records: dict[str, Any]
+    node: tuple[Ros2, ModuleType], port: int, *records: dict[str, Any] | bytes
 ) -> tuple[list[Message], list[Message]]:
     """The poses and transforms for these datagrams, one for each turn of the node's loop."""
     ros, module = node
     ros.topics.clear(), ros.transforms.clear(), ros.warnings.clear()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for record in records:
-            data = json.dumps(record).encode()
+            data = record if isinstance(record, bytes) else json.dumps(record).encode()
             ros.steps.append(lambda data=data: sender.sendto(data, ("127.0.0.1", port)))
         module.main()
     assert not ros.is_running
@@ -173,3 +173,37 @@ def test_the_node_ends_with_ros_or_by_ctrl_c_and_waits_for_poses(
         patch.setattr(ros, "error", error)
         published(node, port)
     patch.setattr(ros, "error", None)
+
+
+def test_a_foreign_datagram_is_reported_once_and_does_not_end_the_node(
+    node: tuple[Ros2, ModuleType], port: int
+) -> None:
+    mine = record_of()
+    foreign: list[dict[str, Any] | bytes] = [
+        b"hello",
+        b"\xff\xfe\x00",
+        b"",
+        b"7",
+        b"[" * 5000,
+        {},
+        {"note": "", "pose": None},
+        {**mine, "pose": {}},
+        {**mine, "pose": {**mine["pose"], "position_m": [1.0, 2.0]}},
+        {**mine, "pose": {**mine["pose"], "frame_id": 7}},
+        {**mine, "unix_s": math.inf},
+    ]
+    poses, transforms = published(node, port, *foreign, mine)
+    assert (len(poses), len(transforms)) == (1, 1)
+    (warning,) = node[0].warnings
+    assert "not from perchctl track --udp; the first is from 127.0.0.1:" in warning
+
+
+def test_a_port_in_use_is_one_sentence(node: tuple[Ros2, ModuleType], port: int) -> None:
+    ros, module = node
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", port))
+        with pytest.raises(SystemExit) as ended:
+            module.main()
+    assert f"cannot receive on 127.0.0.1:{port}: " in str(ended.value)
+    assert "choose another port with --ros-args -p port:=PORT" in str(ended.value)
+    assert not ros.is_running
