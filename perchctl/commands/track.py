@@ -104,6 +104,7 @@ def track(
 
     If a live source is lost for good, the exit code is 10.
     """
+    check_frame_id(frame_id)
     say_on_terminal(f"reading profile {profile}")
     from perchctl.commands.progress import count_bar
     from perchctl.places import is_shipped_example
@@ -273,6 +274,15 @@ def target_in_camera(
 
 TARGET_FRAME_ID = "target"
 """The target's frame in a `pose`, with the axes of docs/conventions.md, as in recordings."""
+
+
+def check_frame_id(frame_id: str) -> None:
+    """Raise InvalidValue for a name that tf2 refuses as the parent of `TARGET_FRAME_ID`."""
+    if not frame_id.strip() or frame_id.startswith("/") or frame_id == TARGET_FRAME_ID:
+        raise InvalidValue(
+            f"--frame-id takes the name of a frame in your tf tree, such as camera_optical_frame, "
+            f"without / at its beginning, and not {TARGET_FRAME_ID}; found {frame_id!r}"
+        )
 
 
 def track_record(

@@ -436,6 +436,15 @@ def test_what_is_not_an_address_is_named(address: str, pictures: Path) -> None:
     assert "--udp takes HOST:PORT, such as 127.0.0.1:9870" in said.complaint
 
 
+@pytest.mark.parametrize("frame_id", ["", "  ", "\t", "/camera", "/", "target"])
+def test_a_frame_that_tf_would_refuse_is_named(frame_id: str, pictures: Path) -> None:
+    said = run("track", str(pictures), "--json", "--frame-id", frame_id)
+    assert said.code == 30
+    (failure,) = map(json.loads, said.stdout.splitlines())
+    assert "--frame-id takes the name of a frame in your tf tree" in failure["error"]
+    assert failure["error"].endswith(f"found {frame_id!r}")
+
+
 def test_a_host_without_an_address_is_named(
     pictures: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
