@@ -387,9 +387,9 @@ def convert(
     perchctl copies names, URIs and, from Crazyswarm2, initial positions and motion-capture bodies.
     These lists contain no targets or cameras: add them to the fleet file.
     """
-    check_output(output, (".yaml", ".yml"), force, "a fleet file")
     say_on_terminal(f"reading {file}")
     found = fleets.convert_fleet(file)
+    check_output(output, (".yaml", ".yml"), force, "a fleet file")
     write_files({output: found.text().encode()})
     if found.skipped:
         say(f"left out because they are switched off: {', '.join(found.skipped)}")

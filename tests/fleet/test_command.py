@@ -79,6 +79,16 @@ def test_convert_writes_a_file_that_says_what_it_lacks(tmp_path: Path) -> None:
     assert (again.code, "add --force" in again.stderr) == (30, True)
 
 
+def test_a_list_that_does_not_exist_is_reported_before_an_output_that_does(tmp_path: Path) -> None:
+    listed, written = tmp_path / "nosuch.yaml", tmp_path / "fleet.yaml"
+    written.write_text("mine")
+    done = run("fleet", "convert", str(listed), "-o", str(written))
+    assert done.code == 20
+    assert f"{listed}: cannot be read: No such file or directory" in done.stderr
+    assert "already exists" not in done.stderr
+    assert written.read_text() == "mine"
+
+
 def test_the_map_has_each_home_and_target_where_it_is() -> None:
     text = draw_text(load_fleet())
     rows = text.splitlines()
