@@ -395,7 +395,9 @@ def convert(
         say(f"left out because they are switched off: {', '.join(found.skipped)}")
     count = len(found.vehicles)
     print(f"wrote {output}: {count} vehicle{'s' if count > 1 else ''}")
+    defaults = found.missing_defaults
+    to_defaults = f"add {', '.join(defaults)} to defaults, and " if defaults else "add "
     print(
-        f"add {', '.join(found.missing)} to each vehicle, then run: "
+        f"{to_defaults}{', '.join(found.missing)} to each vehicle, then run: "
         f"perchctl fleet check {shlex.quote(str(output))}"
     )

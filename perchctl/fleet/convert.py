@@ -3,7 +3,8 @@
 Two formats are read: Crazyswarm2's ``crazyflies.yaml`` (IMRCLab/crazyswarm2, crazyflie/config), and
 the swarm files of Bitcraze's cfcli and Swarmkeeper (bitcraze/cfcli, docs/swarm.md). Neither format
 contains targets or cameras, and cfcli's format contains no positions. `missing` says what you have
-to add; until then, perchctl refuses the file.
+to add to each vehicle; until then, perchctl refuses the file. `missing_defaults` says what you have
+to add to the defaults before the fleet can fly.
 """
 
 from __future__ import annotations
@@ -48,14 +49,24 @@ class ConvertedFleet:
     in_room_axes: bool = False
 
     @property
+    def is_captured(self) -> bool:
+        """True if a motion-capture system measures the positions."""
+        return any(vehicle.body is not None for vehicle in self.vehicles)
+
+    @property
+    def missing_defaults(self) -> tuple[str, ...]:
+        """Return the keys that the fleet's defaults need but the list does not contain."""
+        return ("positioning.system", "positioning.host") if self.is_captured else ()
+
+    @property
     def missing(self) -> tuple[str, ...]:
-        """Return what a fleet file requires but the list does not contain."""
+        """Return the keys that each vehicle needs but the list does not contain."""
         homes = any(vehicle.home_m is None for vehicle in self.vehicles)
         return (*(("home_m",) if homes else ()), "target_m", "source")
 
     def text(self) -> str:
         """Return the text of the fleet file."""
-        mocap = any(vehicle.body is not None for vehicle in self.vehicles)
+        mocap = self.is_captured
         frame = ", frame: room" if self.in_room_axes and not mocap else ""
         positioning = ", positioning: {by: mocap}" if mocap else ""
         lines = [

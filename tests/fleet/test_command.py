@@ -79,6 +79,21 @@ def test_convert_writes_a_file_that_says_what_it_lacks(tmp_path: Path) -> None:
     assert (again.code, "add --force" in again.stderr) == (30, True)
 
 
+@pytest.mark.parametrize("is_tracked", [True, False])
+def test_convert_asks_for_the_motion_capture_that_it_writes(
+    is_tracked: bool, tmp_path: Path
+) -> None:
+    listed, written = tmp_path / "lab.yaml", tmp_path / "fleet.yaml"
+    listed.write_text(
+        "robots: {cf1: {enabled: true, uri: 'usb://0', initial_position: [0, 0, 0], type: cf}}\n"
+        f"robot_types: {{cf: {{motion_capture: {{enabled: {str(is_tracked).lower()}}}}}}}\n"
+    )
+    done = run("fleet", "convert", str(listed), "-o", str(written))
+    assert ("by: mocap" in written.read_text()) is is_tracked
+    keys = "positioning.system, positioning.host to defaults, and " if is_tracked else ""
+    assert f"add {keys}target_m, source to each vehicle" in done.stdout
+
+
 def test_a_list_that_does_not_exist_is_reported_before_an_output_that_does(tmp_path: Path) -> None:
     listed, written = tmp_path / "nosuch.yaml", tmp_path / "fleet.yaml"
     written.write_text("mine")
