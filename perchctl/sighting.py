@@ -70,8 +70,9 @@ class Sighting:
         markers: the detected markers, keyed by ``large`` and ``small``, with `corners_px` (4, 2)
             (top left, top right, bottom right, bottom left on the paper) and their standard
             deviation `sigma_px`.
-        T_cam_target: pose of the target in the camera frame, (4, 4), m, from this image alone; None
-            without an accepted pose.
+        T_cam_target: pose of the target in the camera frame, (4, 4), m, measured in this image and
+            not filtered; None without an accepted pose. In a video or stream, earlier images decide
+            where to search for the markers, and which of two tilts to choose if both fit.
         covariance: covariance of that pose, (6, 6), in ROS's order: shifts along the camera's x, y,
             z (m), then small rotations about the camera's x, y, z (rad); None without a pose.
         T_level_target: pose in the level frame, from the vehicle's centre, (4, 4), m, computed with

@@ -82,7 +82,8 @@ def track(
 
     \b
     frame         file name of the image, or index of the frame
-    t_s           time of exposure; for a live source, on the monotonic clock
+    t_s           time of exposure: on the monotonic clock for a live source, in the
+                  file for a video; for image files, their index / 30 Hz
     unix_s        time of exposure as Unix time, or null for a recording
     stage         detected markers: large, both, small or none
     large, small  null, or corners_px (TL TR BR BL), rvec_rad, tvec_m and
@@ -98,9 +99,10 @@ def track(
     atan2(R[1,0], R[0,0]), the marker's heading in the image plane. sigma_m is along the camera's
     x, y and z axes.
 
-    pose is the target's pose from this image alone, for ROS 2 and your own filters. Its axes
-    are the marker's, turned by 180 deg about x, so that z points away from the camera. covariance
-    has 36 numbers, row by row: x, y, z (m), then small rotations about the camera's x, y, z (rad).
+    pose is the target's pose as measured in this image, not filtered, for ROS 2 and your own
+    filters. Its axes are the marker's, turned by 180 deg about x, so that z points away from the
+    camera. covariance has 36 numbers, row by row: x, y, z (m), then small rotations about the
+    camera's x, y, z (rad).
 
     If a live source is lost for good, the exit code is 10.
     """
@@ -224,7 +226,7 @@ class TrackResult:
         output: the pipeline's output; None if the image was not searched.
         target: the target's pose; if the stage is ``none``, it is predicted by the filter.
         notes: remarks on the image, one sentence each.
-        sighting: the pose from this image alone; None if the image was not searched.
+        sighting: the pose measured in this image; None if the image was not searched.
     """
 
     name: str | int
