@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -83,6 +84,10 @@ def test_readers_find_it_whole_by_its_index_and_foxgloves_own_schemas(
     }
     theirs = {topic: ("protobuf", f"foxglove.{name}") for topic, name in FOXGLOVE_S.items()}
     assert schemas == own | theirs
+    page = (ROOT / "docs" / "after-a-flight.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(/[\w/]+)` \| (\w+), `([\w.]+)` \|", page, re.MULTILINE)
+    encodings = {"JSON": "jsonschema", "protobuf": "protobuf"}
+    assert {topic: (encodings[form], name) for topic, form, name in rows} == schemas
     assert len(found["/camera/image"]) == len(found["/camera/frame"]) == len(FLIGHT.frames)
     assert len(found["/tick"]) == len(found["/tf"]) == len(FLIGHT.ticks)
 
