@@ -82,8 +82,8 @@ def track(
 
     \b
     frame         file name of the image, or index of the frame
-    t_s           time of exposure: on the monotonic clock for a live source, in the
-                  file for a video; for image files, their index / 30 Hz
+    t_s           time of exposure on the monotonic clock; for a video, the
+                  timestamp in the file; for image files, their index / 30 Hz
     unix_s        time of exposure as Unix time, or null for a recording
     stage         detected markers: large, both, small or none
     large, small  null, or corners_px (TL TR BR BL), rvec_rad, tvec_m and
