@@ -143,7 +143,7 @@ class ReplayDiffers(PerchError):
 
 class Interrupted(PerchError):
     exit_code = 130
-    meaning = "interrupted by Ctrl-C: landed, or left standing or hanging"
+    meaning = "interrupted by Ctrl-C: landed, or left on the ground or hanging"
 
 
 def require_type(name: str, value: object, *kinds: type) -> None:

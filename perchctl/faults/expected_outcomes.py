@@ -106,7 +106,7 @@ EXPECTED_OUTCOMES = (
     ),
     ExpectedOutcome(
         "let go after the flight",
-        "the vehicle had hung for as long as perchctl monitors it",
+        "the vehicle hung for as long as perchctl monitored it, then the magnet let go",
         _let_go_later,
     ),
     ExpectedOutcome(

@@ -99,7 +99,7 @@ class AscendConfig(Section):
     settle_timeout_s: ClassVar[float] = 10.0  # time limit for settling at the stand-off
     fresh_s: float = key(
         0.25,
-        "maximum age of a fresh target estimate, in addition to the camera latency",
+        "maximum age at which a target estimate counts as fresh, in addition to the camera latency",
         gt=0,
         le=2,
     )
@@ -210,7 +210,7 @@ class LandingConfig(Section):
     handover_m: float = key(
         0.3, "height above the ground at which the firmware takes over the landing", ge=0.1, le=2
     )
-    undershoot_m: float = key(0.05, "depth below the ground at which the landing aims", ge=0, le=1)
+    undershoot_m: float = key(0.05, "how far below the estimated ground a landing aims", ge=0, le=1)
     drift_mps: ClassVar[float] = 0.012  # assumed drift of the estimated height
     timeout_s: float = key(30.0, "time limit for a landing", gt=0, le=120)
 

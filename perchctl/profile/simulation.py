@@ -112,7 +112,9 @@ class SimulationConfig(Section):
         "additional resistance of an old or cold cell, with a time constant of 15 s",
     )
     cell_charge: Charges = key((0.6, 1.0), "battery charge, as a fraction of a new cell's capacity")
-    cell_knee: Knees = key((0.1, 0.1), "remaining share of charge at which the voltage drops")
+    cell_knee: Knees = key(
+        (0.1, 0.1), "remaining share of charge below which the voltage drops steeply"
+    )
     motor_spread: float = key(
         0.07, "relative standard deviation of the motors' strengths", ge=0, le=0.2
     )

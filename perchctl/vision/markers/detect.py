@@ -300,7 +300,8 @@ def _search_blurred(
 CORNER_METHODS: tuple[CornerMethod, ...] = (
     CornerMethod(
         name="Edge fit",
-        requirements_text="an expected, whole marker with cells of 2.5 px and straight sides",
+        requirements_text="an expected, whole marker with straight sides and cells of at least "
+        "2.5 px",
         cost_text="0.7 ms",
         run_condition_text="the target is expected; after a loss, in three of four images",
         should_run=_is_target_expected,
@@ -316,8 +317,8 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
     ),
     CornerMethod(
         name="Partial-view fit",
-        requirements_text="an expected marker with cells of 4 px, of which 60 % of the cells and "
-        "four edges are visible",
+        requirements_text="an expected marker with cells of at least 4 px, of which at least "
+        "60 % of the cells and four edges are visible",
         cost_text="3 ms for each marker",
         run_condition_text="the edge fit was tried, and a marker is missing; "
         "not if the half-size search found one",
@@ -326,8 +327,8 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
     ),
     CornerMethod(
         name="Photometric fit",
-        requirements_text="a whole marker with sides of 7 px, and approximate corners, to within "
-        "0.3 sides",
+        requirements_text="a whole marker with sides of at least 7 px, whose corners are known to "
+        "within 0.3 times a side",
         cost_text="1.3 ms for each marker",
         run_condition_text="the edge fit was tried, and no marker's edges suffice: its cells are "
         "smaller than 6 px or than six times the blur; not if the half-size search found one",
@@ -336,7 +337,8 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
     ),
     CornerMethod(
         name="Cut-view fit",
-        requirements_text="a measurement at most 0.5 s old, and small-marker cells of 8 px",
+        requirements_text="a measurement at most 0.5 s old, and small-marker cells of at least "
+        "8 px",
         cost_text="7 ms",
         run_condition_text="nothing was found, and each expected marker may be cut off by the edge "
         "of the image or hidden",
@@ -355,7 +357,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
     ),
     CornerMethod(
         name="Blurred search",
-        requirements_text="a whole marker with sides of 7 px that resembles its drawing",
+        requirements_text="a whole marker with sides of at least 7 px that resembles its drawing",
         cost_text="5 to 10 ms",
         run_condition_text="nothing was found; after a loss, in one of four images",
         should_run=_can_target_be_blurred,
