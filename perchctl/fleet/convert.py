@@ -3,8 +3,7 @@
 Two formats are read: Crazyswarm2's ``crazyflies.yaml`` (IMRCLab/crazyswarm2, crazyflie/config), and
 the swarm files of Bitcraze's cfcli and Swarmkeeper (bitcraze/cfcli, docs/swarm.md). Neither format
 contains targets or cameras, and cfcli's format contains no positions. `missing` says what you have
-to add to each vehicle; until then, perchctl refuses the file. `missing_defaults` says what you have
-to add to the defaults before the fleet can fly.
+to add before perchctl accepts the file.
 """
 
 from __future__ import annotations
@@ -172,7 +171,7 @@ def _uri(where: str, entry: Mapping[str, Any]) -> str:
 
 
 def _place(where: str, value: Any) -> tuple[float, float] | None:
-    """The first two of the numbers x, y, z; None if there are none."""
+    """Return x and y of a position x, y, z; None if no position is given."""
     if value is None:
         return None
     numbers = value if isinstance(value, list) else []

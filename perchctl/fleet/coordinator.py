@@ -68,7 +68,7 @@ class Child(Protocol):
         were valid."""
 
     def end_of_process(self) -> str | None:
-        """Return how the process ended without a result, in words; None while it runs."""
+        """Return how the process ended without a result, in words; None while it is running."""
 
     def kill(self) -> None:
         """End the process at once."""
@@ -153,7 +153,8 @@ class Coordinator:
         self._views = tuple(
             self._heard(name, child, now_s) for name, child in self._children.items()
         )
-        # read only once: a command to land must not follow the permission that it would prevent
+        # Read only once per round: if a second read returned a new command to land, the permission
+        # to start would already have been given.
         word = self._switch.read()
         if self._confirmed and are_all_ready(self._views) and word is OperatorRequest.NONE:
             self.started = True
@@ -274,8 +275,8 @@ class Coordinator:
 
 
 def _explained(result: Result, why: str | None) -> Result:
-    """Return the result, with the reason `why`, for a vehicle that the parent has landed or did not
-    permit to fly."""
+    """Return the result, with the reason `why`, for a vehicle that the parent has landed or has not
+    permitted to fly."""
     if why is None or result.exit_code == 0:
         return result
     return replace(result, reason=f"{why}: {result.reason}")

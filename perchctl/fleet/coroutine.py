@@ -28,8 +28,8 @@ class CoroutineClosed(BaseException):
 class ThreadCoroutine(Generic[R]):
     """Runs `function` from one `pause` to the next; the function itself calls `pause`.
 
-    `result` is the function's return value; None until it has returned. Close the object at the
-    end, because a thread that waits forever keeps everything that its function refers to in memory.
+    `result` is the function's return value; None until it has returned. Close the object after use,
+    because a thread that waits forever keeps everything that its function refers to in memory.
     """
 
     def __init__(self, function: Callable[[], R], name: str) -> None:

@@ -46,11 +46,11 @@ margin, m; the positions of both may be wrong by `ROOM_ERROR_M`. Larger: two veh
 each other are noticed later. Smaller: position errors make vehicles land that are far enough
 apart."""
 FRESH_PLACE_S = 0.5
-"""Age above which a position is unknown, s. Longer: two vehicles that fly at 0.4 m/s towards each
-other may come 0.4 m closer unnoticed. Shorter: with slow telemetry, and a status ten times a
+"""Age above which a position counts as unknown, s. Longer: two vehicles that fly at 0.4 m/s towards
+each other may come 0.4 m closer unnoticed. Shorter: with slow telemetry, and a status ten times a
 second, distances are unknown all the time."""
 HUNG_S = 10.0
-"""Time without a message after which a process is ended, s. The vehicle of such a process is
+"""Time without a message after which a process is killed, s. The vehicle of such a process is
 already down, since the firmware stops the motors 2 s after the last packet. Longer: the fleet waits
 needlessly. Shorter: flights are lost when a computer pauses, and a neighbour climbs while a vehicle
 that nobody controls may still be in the air."""
@@ -147,8 +147,8 @@ def decide(
         landed: vehicles that the operator has landed individually.
     """
     ended = {view.name: view.result for view in views if view.result is not None}
-    # Once the fleet flies, a vehicle that the operator has landed individually does not count as
-    # failed.
+    # Once the fleet is flying, a vehicle that the operator has landed individually does not count
+    # as failed.
     by_key = {
         name
         for name, result in ended.items()
@@ -238,9 +238,9 @@ def find_climb_obstacle(plan: FleetPlan, name: str, views: Sequence[VehicleView]
     is, or may be, within the plan's separation from its climb, a column as wide as its corridor.
 
     A vehicle without a known position is assumed to be in its corridor only if it has no position
-    in room axes to report, still flies, answers, and is not landing. Otherwise the vehicle may be
-    up to `TARGET_ALONE_M` away from its path. The same applies to a vehicle whose flight has ended
-    without a known landing, until it is down.
+    in room axes to report, is still flying, answers, and is not landing. Otherwise the vehicle may
+    be up to `TARGET_ALONE_M` away from its path. The same applies to a vehicle whose flight has
+    ended without a known landing, until it is down.
     """
     target_m, radius_m = plan.fleet.vehicle(name).target_m, plan.corridors[name].radius_m
     least_m = radius_m + plan.separation_m - ROUNDING_M
@@ -286,8 +286,8 @@ def find_obstacle(plan: FleetPlan, name: str, ended: Mapping[str, Result]) -> st
 
 
 def is_at_home(vehicle: FleetVehicle, result: Result) -> bool:
-    """True if a vehicle whose flight has ended is known to be on the floor where it took
-    off. An estimate that starts at zero drifts, so it cannot show where the vehicle is."""
+    """True if a vehicle whose flight has ended is known to be on the floor where it took off. An
+    estimate that starts at zero drifts, so it cannot show where the vehicle is."""
     if not result.has_flown:
         return True
     if result.hangs or vehicle.frame != "room" or result.place_m is None:

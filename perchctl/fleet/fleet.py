@@ -43,8 +43,8 @@ class FleetVehicle:
         heading_deg: direction in which its nose points at home, counter-clockwise from the room's x
             axis.
         frame: the origin and axes of its state estimate. ``room``: those of the room, as with
-            motion capture, Lighthouse or Loco. ``home``: the estimate starts at zero where the
-            vehicle stands, as with a Flow deck or the target alone.
+            motion capture, Lighthouse or Loco. ``home``: the estimate is zero where the vehicle
+            starts, as with a Flow deck or the target alone.
     """
 
     name: str
@@ -79,7 +79,7 @@ class FleetVehicle:
     @property
     def as_flown(self) -> FleetVehicle:
         """The vehicle with the axes that its own process uses. The axes of a simulated vehicle have
-        their origin where it stands, even if a simulated motion-capture system measures its
+        their origin where it starts, even if a simulated motion-capture system measures its
         position."""
         if not self.simulated or self.frame == "home":
             return self
@@ -108,7 +108,7 @@ class FleetVehicle:
         """The vehicle with a target at this position in the room. `target`: the target's markers,
         by default those in the vehicle's profile.
 
-        A vehicle that flies with the target alone gets no approach point. Such a vehicle stands
+        A vehicle that flies with the target alone gets no approach point. Such a vehicle starts
         below its target, and with a heading error of a few degrees it would first fly away from the
         target.
         """

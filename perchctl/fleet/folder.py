@@ -61,7 +61,8 @@ def _filmed(
     log = Path(flight.log.path)
     pace = (end.get("pace") or {}).get("ratio") or 1.0
     lasts_s = flight.log.end_s / pace
-    # A simulated vehicle's estimate starts where it stands, even with motion capture.
+    # A simulated vehicle's estimate has its origin where the vehicle starts, even with motion
+    # capture.
     is_simulated = str(plan["uri"]).startswith("sim://")
     return FilmedVehicle(
         name=name,

@@ -32,7 +32,7 @@ def identify_fleet(
 
 
 def make_stand(fleet: Fleet, vehicle: FleetVehicle) -> Stand:
-    """Return where this vehicle stands, and what the other vehicles would observe from there."""
+    """Return this vehicle's home, and what the other vehicles would observe from there."""
     flown = vehicle.as_flown
     others = [other for other in fleet.vehicles if other.name != vehicle.name]
     own_m, within_m = _seen_m(vehicle, vehicle.target_m), vehicle.profile.target.expected_within_m

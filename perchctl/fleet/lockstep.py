@@ -9,9 +9,9 @@ a `ThreadCoroutine` that pauses at each tick of the room's clock:
             each flight runs until its own clock has reached the room's     (in the fleet's order)
             the room measures distances, and updates the downwash on each vehicle
 
-Meanwhile, the vehicles of later groups stand at their homes. A vehicle whose flight has ended stays
-where it hangs, stands or lies. A vehicle of the next group takes off only if none of these vehicles
-is in its way.
+Meanwhile, the vehicles of later groups wait on the floor at their homes. A vehicle whose flight has
+ended stays where it is, whether it is hanging, standing or lying. A vehicle of the next group takes
+off only if none of these vehicles is in its way.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ TICK_S = 0.02
 collision between two ticks is missed, and the downwash is late. Smaller: the flights wait for each
 other more often."""
 AT_HOME_M = 0.12
-"""Distance from its home within which a landed vehicle stands where the plan expects it, m; it is
-the radius of a vehicle according to Crazyswarm. Larger: a plan is trusted although its obstacles
-have moved."""
+"""Distance from its home within which a landed vehicle counts as being where the plan expects it,
+m; it is the radius of a vehicle according to Crazyswarm. Larger: a plan is trusted although its
+obstacles have moved."""
 CAUSE_S = (1.0, 25.0)
 """Times after the start of a group within which a common cause begins, s: after 25 s nearly all
-vehicles hang."""
+vehicles are hanging."""
 FOR_GOOD_S = 1e3
 """Duration above which a common cause is permanent, longer than any flight, s."""
 _FAULT_STREAM = 32
@@ -312,7 +312,8 @@ class FleetFlight:
     # --- Vehicles that must not start ---
 
     def _refuse(self, name: str) -> bool:
-        """Record that a vehicle that must not take off was refused and stands at its home."""
+        """If this vehicle must not take off, record that it was refused and is still at its home,
+        and return True."""
         reason = self._refusal(name)
         if not reason:
             return False

@@ -3,7 +3,7 @@
     parent  --- Order, ten times a second and when it changes --->  vehicle
     parent  <-- Status, ten times a second, and one Result -------  vehicle
 
-Every message contains a complete state, never a change of one. If a message is lost, late or
+Every message contains a complete state, never only what has changed. If a message is lost, late or
 duplicated, the next one corrects it, and no message needs an answer. The command in the last
 `Order` that arrives stays valid, and without another order the vehicle lands after
 `perchctl.fleet.parent_watch.PARENT_SILENCE_S`. A permission to take off is valid only for the
@@ -43,7 +43,7 @@ class Stage(Enum):
 class VehicleOutcome(Enum):
     """How one vehicle ended."""
 
-    PERCHED = "perched"  # it hangs with its motors off
+    PERCHED = "perched"  # it is hanging with its motors off
     LANDED = "landed"
     ABORTED = "aborted"
     FAILED = "failed"  # its flight raised an exception, or its process was lost
@@ -160,7 +160,7 @@ class Result:
 
     @property
     def hangs(self) -> bool:
-        """True if it is known to hang with its motors off."""
+        """True if the vehicle is known to be hanging with its motors off."""
         return self.outcome is VehicleOutcome.PERCHED
 
 

@@ -45,7 +45,8 @@ _WORST_FIRST: tuple[type[PerchError], ...] = (
     UsageError,
     LogIncomplete,
     ReplayDiffers,
-    Interrupted,  # last, because vehicles that land after another's failure also end with it
+    # last, because the vehicles that land after another one's failure also end with `Interrupted`
+    Interrupted,
 )
 
 
@@ -60,8 +61,8 @@ def worst_code(codes: Iterable[int]) -> int:
 
 
 def fleet_exit_code(results: Sequence[Result]) -> int:
-    """Return 0 if all vehicles hang and their logs are complete, otherwise the exit code of the
-    vehicle with the worst result."""
+    """Return 0 if all vehicles are hanging and their logs are complete, otherwise the exit code of
+    the vehicle with the worst result."""
     return worst_code(result.exit_code for result in results)
 
 
@@ -118,7 +119,7 @@ class FleetOutcome:
 
     @property
     def hanging(self) -> int:
-        """The number of vehicles that hang."""
+        """The number of vehicles that are hanging."""
         return sum(result.hangs for result in self.results.values())
 
     @property

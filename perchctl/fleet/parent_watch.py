@@ -26,7 +26,8 @@ noticed late."""
 
 PERMISSION_FRESH_S = 0.5
 """Age up to which a permission to climb counts, s; it is repeated every `BEAT_S`. Longer: a climb
-may begin although a neighbour has come near since. Shorter: a busy computer delays climbs."""
+may begin although a neighbour has come near in the meantime. Shorter: a busy computer delays
+climbs."""
 
 
 @dataclass

@@ -31,7 +31,8 @@ def make_folder(parent: Path, plan: FleetPlan, started: datetime) -> Path:
 
 IDLE_PER_S = 10
 """Packets per second for a vehicle whose flight has ended, the lowest limit that a hub allows.
-Larger: less radio time is left for the vehicles that still fly. A smaller limit is not possible."""
+Larger: less radio time is left for the vehicles that are still flying. A smaller limit is not
+possible."""
 
 
 class Radios:

@@ -32,10 +32,10 @@ ALONE_PER_S = 1000.0
 change."""
 SAME_CHANNEL_PER_S = {2: 245.0, 3: 162.0, 4: 123.0}
 """Measured packets per second for each of this many vehicles on one channel of one dongle. Too
-large: telemetry comes late in flight. Too small: fleets that could fly are refused."""
+large: telemetry arrives late in flight. Too small: fleets that could fly are refused."""
 OTHER_CHANNELS_PER_S = {2: 151.0, 4: 73.0}
 """Measured packets per second for each of this many vehicles on different channels of one dongle.
-Because they are so few, perchctl refuses such fleets."""
+Because these rates are so low, perchctl refuses such fleets."""
 PACKET_S = 0.00206
 """Duration of a packet on a shared dongle, s, the longest of `SAME_CHANNEL_PER_S` (3 vehicles): 0.7
 ms on the air, 1.25 ms for the address, and the rest for Python's threads. This duration is used for
@@ -44,9 +44,9 @@ USABLE_SHARE = 0.8
 """Usable part of a vehicle's share of the packets. The rest is for lost packets, for a neighbour
 that does not answer, which costs 2 ms per turn (measured), and for a busy computer. On a busy
 computer, a hub over the same simulated dongle carried 207 packets per second for each of two
-vehicles and 111 for each of four, 0.85 and 0.9 of the shares. Larger: telemetry comes late; at 0.9,
-in one run, two simulated flights with telemetry every 10 ms were aborted. Smaller: telemetry is
-slower than necessary."""
+vehicles and 111 for each of four, 0.85 and 0.9 of the shares. Larger: telemetry arrives late; at
+0.9, in one run, two simulated flights with telemetry every 10 ms were aborted. Smaller: telemetry
+is slower than necessary."""
 MOST_ON_A_DONGLE = 5
 """Largest number of vehicles on one dongle: users of cflib report three to five."""
 LEAST_APART = 2

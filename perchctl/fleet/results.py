@@ -12,7 +12,7 @@ from perchctl.faults import ENDS, FLAGS, HEALTHY, FaultResult, fault_summary
 
 _FROM_GOOD_TO_BAD = ("perched", "landed", "refused", "aborted", "failed", "gone")
 WORST_FLEETS = 10
-"""Number of the worst fleets that are named in the text."""
+"""How many of the worst fleets the text names."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class FleetResult(CampaignFlight):
         vehicles: result of each vehicle, in the order of `names`.
         collisions: number of pairs in `collided`, which came so close that they touched.
         least_distance_m: smallest horizontal distance between two vehicles while the motors of at
-            least one turned.
+            least one were turning.
         least_distance_in_air_m: smallest horizontal distance between two vehicles while the motors
-            of both turned; None if no two vehicles had their motors running at the same time.
+            of both were turning; None if no two vehicles had their motors running at the same time.
         separation_m: the plan's separation between the corridors of two vehicles that fly together.
         time_s: time from the start of the first group to the end of the last one.
     """

@@ -129,13 +129,12 @@ def _neighbours(
 
 def body_name(name: str) -> str:
     """Return the name of a vehicle's rigid body in the simulated motion-capture system of another
-    vehicle. In its own system, the body has the name given in its profile."""
+    vehicle. In the vehicle's own system, its body has the name given in its profile."""
     return f"body of {name}"
 
 
 class Body:
-    """One vehicle in the room: a simulated one, or one that stands, hangs or lies at a fixed
-    position."""
+    """One vehicle in the room: simulated, or at rest at a fixed position."""
 
     def __init__(self, placed: PlacedVehicle) -> None:
         self._true = placed.true
@@ -169,7 +168,7 @@ class Body:
 
     @property
     def turns(self) -> bool:
-        """True if its motors turn."""
+        """True if the vehicle's motors are turning."""
         return self._vehicle is not None and max(self._vehicle.firmware.motors) > 0.0
 
     def in_own_axes(self, place_m: _Place) -> _Place:
@@ -185,9 +184,9 @@ class Room:
             `COLLISION_RADIUS_M` and `COLLISION_HALF_HEIGHT_M`, even if one fell onto the other with
             its motors off.
         least_m: smallest distance between the centres of two vehicles while the motors of at least
-            one turn; infinite at first. Only the horizontal distance counts, since corridors are
-            separated regardless of height.
-        least_both_m: the same distance while the motors of both vehicles turn.
+            one are turning; infinite at first. Only the horizontal distance counts, since corridors
+            are separated regardless of height.
+        least_both_m: the same distance while the motors of both vehicles are turning.
     """
 
     def __init__(self, placed: Sequence[PlacedVehicle]) -> None:

@@ -6,9 +6,9 @@ The corridor's radius depends on the positioning:
     Flow deck                                      WANDER_M + FLOW_DRIFT_MPS * time without target
     target alone                                   TARGET_ALONE_M
 
-Two vehicles are in the air together only if their corridors keep the separation and neither stands
-near the other's corridor. A vehicle that waits on the floor, or that hangs, is an obstacle for the
-others:
+Two vehicles are in the air together only if their corridors keep the separation and neither takes
+off near the other's corridor. A vehicle that waits on the floor, or that hangs, is an obstacle for
+the others:
 
     i waits in j's corridor  ->  i flies before j
     i hangs in j's corridor  ->  j flies before i
@@ -83,9 +83,9 @@ def corridor_radius_m(vehicle: FleetVehicle) -> float:
 
 
 def _unseen_s(profile: Profile) -> float:
-    """Return the longest time for which only the estimate shows where the vehicle is: take-off and
-    flight to the target, the whole search, and the descent from the height limit. Under its target,
-    the vehicle steers by the camera."""
+    """Return the longest time for which the vehicle's position is known only from its estimate:
+    take-off and flight to the target, the whole search, and the descent from the height limit.
+    Under its target, the vehicle steers by the camera."""
     planner = profile.planner
     search_s = planner.search.attempts * planner.search.wait_s
     descent_s = profile.safety.max_height_m / planner.landing.speed_mps
@@ -121,7 +121,7 @@ def estimate_corridor(vehicle: FleetVehicle, estimate: FleetVehicle | None = Non
 
 def flown_profile(vehicle: FleetVehicle, estimate: FleetVehicle | None = None) -> Profile:
     """Return the profile with which a vehicle of a fleet flies: its own profile, with its corridor
-    as a safety limit (`safety.corridor`). Outside the corridor, the vehicle lands.
+    as a safety limit (`safety.corridor`). If the vehicle leaves its corridor, it lands.
 
     `estimate`: the same vehicle with an estimate in other axes, whose profile is used instead.
     """

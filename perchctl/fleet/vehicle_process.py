@@ -192,7 +192,7 @@ class ParentLine:
         return None
 
     def _interrupt_start_alone(self) -> None:
-        """After the parent is gone, wait until the start can be interrupted or the loop reads
+        """Once the parent is gone, wait until the start can be interrupted or the loop reads
         commands."""
         while self._result is None and not (self._has_interrupted or self._switch.listening):
             self._interrupt_start()
@@ -343,7 +343,7 @@ class StatusReporter(Watcher):
 
 
 def flight_status(tick: Tick) -> Status:
-    """Return the status of a vehicle that flies, hangs or has landed."""
+    """Return the status of a vehicle that is flying, is hanging or has landed."""
     state, telemetry, target = tick.state, tick.telemetry, tick.target
     x_m, y_m, z_m = telemetry.position_m
     return Status(

@@ -129,7 +129,7 @@ class GroundCriteria:
     @property
     def waits_for_arming(self) -> bool:
         """True if the vehicle does not arm itself and only arming is missing. `fly` arms it last,
-        just before take-off. Also true while its motors start."""
+        just before take-off. Also true while its motors are starting."""
         telemetry = self.telemetry
         if telemetry.has_bit(CAN_FLY):
             return False
@@ -246,8 +246,8 @@ class GroundCriteria:
 
     @property
     def off_ground(self) -> Problem | None:
-        """Problem: according to the settled state estimate, the vehicle is not on the ground; it
-        hangs or is being held."""
+        """Problem: according to the settled state estimate, the vehicle is not on the ground; it is
+        hanging or being held."""
         return self._off_the_ground(
             self.telemetry.position_m[2],
             "the state estimate places the vehicle at",
@@ -271,7 +271,7 @@ class GroundCriteria:
 
     @property
     def not_level(self) -> Problem | None:
-        """Problem: the vehicle does not stand level enough to take off."""
+        """Problem: the vehicle is not level enough to take off."""
         most_deg = self.profile.safety.start_tilt_deg
         if self.tilt_deg <= most_deg:
             return None
@@ -283,7 +283,7 @@ class GroundCriteria:
 
     @property
     def not_still(self) -> Problem | None:
-        """Problem: the accelerometer does not read 1 g, so the vehicle moves or vibrates."""
+        """Problem: the accelerometer does not read 1 g, so the vehicle is moving or vibrating."""
         acc_z_g = self.telemetry.acc_z_g
         if abs(acc_z_g - 1.0) <= REST_ACC_G:
             return None
@@ -291,7 +291,7 @@ class GroundCriteria:
 
     @property
     def stands(self) -> bool:
-        """True if the accelerometer shows a vehicle that stands level and still."""
+        """True if the accelerometer shows that the vehicle is level and still."""
         return self.not_level is None and self.not_still is None
 
     @staticmethod
@@ -312,7 +312,7 @@ class GroundCriteria:
 
     @staticmethod
     def target_too_near(target: TargetEstimate | None) -> Problem | None:
-        """Problem: the target is too close for a vehicle that stands on the ground."""
+        """Problem: the target is too close for a vehicle that is on the ground."""
         if target is None or not target.tracked:
             return None
         away_m = math.hypot(*(float(e) for e in target.e_m))
@@ -329,10 +329,10 @@ class GroundCriteria:
         """Problem: within the `rest_window` of `samples` (oldest first), the state estimate has
         moved, or its mean velocity was too high.
 
-        The vehicle stands still, so something misleads its estimate: optical flow over a dark
+        The vehicle is not moving, so something is misleading its estimate: optical flow over a dark
         floor, a base station that was moved, or the positions of another body. It is also possible
-        that somebody carries the vehicle too smoothly for its accelerometer to detect it. If the
-        samples span less time, only those are checked.
+        that somebody is carrying the vehicle too smoothly for its accelerometer to detect the
+        motion. If the samples span less time, only those are checked.
         """
         if not samples:
             return None
@@ -365,7 +365,7 @@ class GroundCriteria:
     @staticmethod
     def moved_body(moved_m: float, profile: Profile) -> Problem | None:
         """Problem: the external positions have moved by `moved_m` while the vehicle stood still.
-        The positions belong to another rigid body, or the target swings."""
+        The positions belong to another rigid body, or the target is swinging."""
         if moved_m <= WANDERED_M:
             return None
         return Problem(
@@ -467,7 +467,7 @@ class RestCheck:
         """Problem: the rigid body has moved since the vehicle came to rest.
 
         Must be called in each turn with fresh telemetry and a fresh position. `place` is None while
-        the vehicle does not stand still, which restarts the check."""
+        the vehicle is not standing still, which restarts the check."""
         self._from = None if place is None else self._from or place
         if place is None or self._from is None:
             return None

@@ -124,7 +124,7 @@ class FlightInputs:
             search: search the frame for the target; otherwise the frame only shows that the camera
                 works.
             sends_sights: send the positions measured from the target if it is the positioning
-                system; False once the vehicle descends without them.
+                system; False once the vehicle is descending without them.
             drops_sightings: discard the detections from which the vehicle's motion is estimated.
         """
         self.sends_sights = sends_sights
@@ -305,11 +305,11 @@ class FlightInputs:
 
 
 # --- The target as positioning system, tick by tick ---
-# While the vehicle stands on the floor, presses against the ceiling or hangs, its position is known
-# better than from any image, so the known position is sent instead. The known position is sent only
-# until the first sample in which the accelerometer no longer shows that something supports the
-# vehicle. Otherwise a falling vehicle would receive the position of a hanging one, and its estimate
-# would agree.
+# While the vehicle is standing on the floor, pressing against the ceiling or hanging, its position
+# is known more precisely than any image could show it, so the known position is sent instead. The
+# known position is sent only until the first sample in which the accelerometer no longer shows that
+# something supports the vehicle. Otherwise a falling vehicle would receive the position of a
+# hanging one, and its estimate would agree.
 
 
 SUPPORTED_FOR_S = 0.1

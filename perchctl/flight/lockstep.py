@@ -132,8 +132,8 @@ class TruthWatcher(Watcher):
 class LockstepFlight:
     """A finished flight, with the vehicle's true final state.
 
-    `miss_m`: horizontal distance from the gear to the target's centre. `hanging`: the vehicle hangs
-    from the magnet. `locked`: the firmware's supervisor has locked the vehicle.
+    `miss_m`: horizontal distance from the gear to the target's centre. `hanging`: the vehicle is
+    hanging from the magnet. `locked`: the firmware's supervisor has locked the vehicle.
     """
 
     report: FlightReport

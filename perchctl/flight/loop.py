@@ -57,8 +57,8 @@ TURN_HANG_S = 0.25
 """Duration of a turn above which something has hung, so that the turn's data about the vehicle is
 out of date, s."""
 PERMISSION = "permission to take off"
-"""The only remaining condition for a vehicle whose own checks have passed while other vehicles fly
-in the same room, as shown to the operator."""
+"""The only remaining condition for a vehicle whose own checks have passed while other vehicles are
+flying in the same room, as shown to the operator."""
 PERMISSION_PERIOD_S = 0.1
 """Period of the turns while waiting for permission, s. Longer: more time passes between the
 permission and the take-off. Shorter: vehicles on the floor take computing time from those in the
@@ -82,11 +82,12 @@ class FlightParts:
     decks measure them. `remarks` returns new notes on things that do not affect safety, such as a
     recording. `table` replaces the profile's transition table. `begin_turn` is called in the loop's
     own thread at the beginning of each turn, also before take-off. `may_take_off` is called in each
-    turn before take-off with the conditions that the vehicle still waits for, empty once its own
-    checks have passed. Until it returns True, the vehicle stays disarmed on the floor and the
-    checks continue. `climb_withheld` is called in each turn of the mission; while it returns a
-    reason, the vehicle does not begin to climb to its target. If the flight is `simulated`, its
-    measured latency and mounting are not suggested for the profile."""
+    turn before take-off with a text that lists the conditions the vehicle is still waiting for; the
+    text is empty once the vehicle's own checks have passed. Until it returns True, the vehicle
+    stays disarmed on the floor and the checks continue. `climb_withheld` is called in each turn of
+    the mission; while it returns a reason, the vehicle does not begin to climb to its target. If
+    the flight is `simulated`, its measured latency and mounting are not suggested for the
+    profile."""
 
     link: Link
     source: FrameSource

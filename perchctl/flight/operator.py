@@ -256,8 +256,8 @@ def _listen(reader: socket.socket, switch: OperatorSwitch, report: Callable[[str
         if any(number in LANDING_SIGNALS for number in numbers):
             switch.land()
         if switch.listening and signal.SIGTSTP in numbers:
-            # The line is not printed from this thread, which would block if the terminal is stopped
-            # by Ctrl-S.
+            # The line is not printed from this thread, because the thread would block if Ctrl-S had
+            # stopped the terminal's output.
             threading.Thread(target=report, args=(_NO_SUSPENDING,), daemon=True).start()
 
 

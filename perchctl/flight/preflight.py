@@ -179,8 +179,8 @@ def still_waiting_for(turn: GroundTurn) -> str:
 
 
 def _unrest(samples: Sequence[Telemetry], profile: Profile) -> Problem | None:
-    """Problem: the estimate moves, or has not been still for long enough. A gap in the telemetry
-    does not count as being still."""
+    """Problem: the estimate is moving, or has not been still for long enough. A gap in the
+    telemetry does not count as being still."""
     window = rest_window(samples)
     seen_s = window[-1].t_s - window[0].t_s
     if seen_s < REST_S:
@@ -218,7 +218,7 @@ state is unknown. Shorter: a brief disturbance ends the flight."""
 
 
 class Arming:
-    """Arms a vehicle that does not arm itself once all other checks have passed.
+    """Once all other checks have passed, arms a vehicle that does not arm itself.
 
     Arming is the last step, after the operator's confirmation, because the propellers turn from
     then on. After the first request, other checks may fail for no longer than `ARMING_PAUSE_S`. A
@@ -256,7 +256,7 @@ class Arming:
         `waits_for_arming`, with fresh telemetry.
 
         Raises TimedOut if the vehicle is not armed within `ARMS_WITHIN_S`, and SafetyAbort if it
-        disarms itself while its motors start.
+        disarms itself while its motors are starting.
         """
         if self._began_s is None:
             self._began_s = now_s

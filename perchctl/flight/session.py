@@ -90,7 +90,8 @@ def check_options(options: FlyOptions) -> None:
     if options.profile.positioning.source.is_mocap and not options.simulated:
         PositionFeed.check_config(options.profile.positioning)
     elif options.profile.positioning.source.is_mocap and find_spec("motioncapture") is None:
-        raise no_motion_capture()  # the simulated system needs this library too, but no host
+        # a simulated motion-capture system also needs this library, but not `positioning.host`
+        raise no_motion_capture()
     source = parse_source(options.source)
     if source.is_own:
         load_extension(options.source, "camera.source")
@@ -189,7 +190,8 @@ def fly_session(
                     waiting.enter_context(clock.waiting_for_loop())
                 report = fly(parts)
         finally:
-            switch.listening = switch.closing = True  # Ctrl-C must not interrupt the closing
+            # Ctrl-C must not interrupt the closing of the link
+            switch.listening = switch.closing = True
             link.close()
         return report, _true_miss_m(simulated)
 

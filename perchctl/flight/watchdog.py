@@ -2,11 +2,11 @@
 error.
 
 The watchdog decides what the link sends (`Link.set_guard`), in a thread that a hanging loop cannot
-block. Before the loop's first tick the vehicle does not fly, and the watchdog only obeys the
+block. Before the loop's first tick the vehicle is not flying, and the watchdog only obeys the
 operator's command: it cuts the motors or disarms. After `REPEAT_AFTER_S` of silence, the watchdog
 holds the last position, but never a position above the vehicle, so that the vehicle neither climbs
-nor presses against the ceiling. The exception is a vehicle that sinks: it keeps a setpoint above
-itself, which brakes it. The lander of `perchctl.mission` takes over after
+nor presses against the ceiling. The exception is a vehicle that is sinking: it keeps a setpoint
+above its own position, which slows its descent. The lander of `perchctl.mission` takes over after
 `safety.loop_late_land_s`, on the operator's command, or if the loop was already descending or had
 put the weight on the magnet. With decks or motion capture, the lander commands the firmware's own
 landing at once, three to six times, because a late loop cannot steer. With the target as the only
@@ -269,7 +269,7 @@ def rescue(
     on_sent: Callable[[SentCommand], None] = lambda sent: None,
     motion: VisualInertialMotion | None = None,
 ) -> RestReport:
-    """Land a vehicle that still flies, without planner, camera and log, within the time that a
+    """Land a vehicle that is still flying, without planner, camera and log, within the time that a
     normal landing takes. Return where the vehicle came to rest.
 
     Args:

@@ -3,8 +3,8 @@ continues.
 
 A panel, a page, a callback or a log may fail in any tick. The observer is then detached, the other
 observers are informed, and the flight continues without it. Two kinds of exceptions are raised
-after the loop has landed the vehicle: errors from the judges, without which a simulated flight
-would prove nothing, and requests to exit (KeyboardInterrupt, SystemExit).
+after the loop has landed the vehicle: errors from the judges, because without its judges a
+simulated flight would prove nothing, and requests to exit (KeyboardInterrupt, SystemExit).
 """
 
 from __future__ import annotations

@@ -41,14 +41,14 @@ def disarm(
     """Repeat the disarm command to a vehicle on the ground until its telemetry confirms it, for at
     most `DISARM_S`.
 
-    Nothing is sent to a vehicle that arms itself, or that is not armed unless `was_ordered`. The
-    command is sent only while fresh telemetry shows that the vehicle is not flying, because it
-    would cut the motors in the air. The flying bit stays set for 2 s after the motors stop. Returns
-    False if the vehicle may still be armed.
+    Nothing is sent to a vehicle that arms itself or, unless `was_ordered`, to one that is not
+    armed. The command is sent only while fresh telemetry shows that the vehicle is not flying,
+    because it would cut the motors in the air. The flying bit stays set for 2 s after the motors
+    stop. Returns False if the vehicle may still be armed.
 
     Args:
         newest: function that returns the newest telemetry, or None if there is none.
-        send: function that queues a command for the vehicle, after those that already wait.
+        send: function that queues a command for the vehicle, after those that are already waiting.
         clock, wait: functions that return the current time, s, and wait for a number of seconds.
         was_ordered: True if this session has sent `Arm(True)`, which may take effect at any time.
             Only a sample newer than the disarm command then confirms that the vehicle is disarmed.

@@ -2,9 +2,9 @@
 this link.
 
 Every call that may block has a timeout, and cflib's callbacks make no blocking calls. The link is
-closed only when nothing flies: `close_link` sends a zero setpoint, which drops a flying vehicle
-(docs/firmware.md, "When setpoints stop"). If the radio falls silent, perchctl waits; if a driver
-has ended, perchctl reopens it.
+closed only when the vehicle is not flying: `close_link` sends a zero setpoint, which drops a flying
+vehicle (docs/firmware.md, "When setpoints stop"). If the radio falls silent, perchctl waits; if a
+driver has ended, perchctl reopens it.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ SILENCE_S = 1.5
 DRAIN_S = 1.0
 """Longest wait for queued commands when the link is closed, s."""
 UNHEARD_S = 0.5
-"""A packet counts as lost with the link if it was sent less than this time before the vehicle was
-last heard, or after that, s."""
+"""A packet counts as lost with the link if it was sent after the vehicle was last heard from, or
+less than this time before that, s."""
 FAREWELL = RawThrust(0)
 """The command that cflib's `close_link` sends."""
 
@@ -72,8 +72,8 @@ class CflibLink:
     """`perchctl.link.protocol.Link`, implemented with an unmodified cflib.
 
     `connection` is None while not connected. `landing_wait_s` is the time for which `close` waits
-    for a vehicle that still flies. Unless `positioning` uses decks, the estimator is configured for
-    external positions.
+    for a vehicle that is still flying. Unless `positioning` uses decks, the estimator is configured
+    for external positions.
 
     `uri` names the vehicle in every message. `link_uri` is what cflib opens instead, such as the
     vehicle behind a radio hub; it contains a key and is never shown.

@@ -141,6 +141,6 @@ UNLOCK_THRUST = (_raw(0), _NOTIFY)
 priority of low-level setpoints. Without the zero-thrust packet, raw thrust stays 0; without the
 notify message, the firmware does not execute its own landing (docs/firmware.md, "Raw thrust"). The
 vehicle does not confirm these packets, and if they were lost, the first raw thrust in the air would
-cut the motors. The packets are therefore sent `UNLOCK_TIMES`."""
+cut the motors. The packets are therefore sent `UNLOCK_TIMES` times."""
 UNLOCK_TIMES, UNLOCK_PERIOD_S = 5, 0.02
 """Number of repetitions of `UNLOCK_THRUST`, and the time between them, s."""

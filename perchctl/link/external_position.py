@@ -125,7 +125,7 @@ def _agree(
     wait: Callable[[float], None],
 ) -> bool:
     """Return True once fresh samples of feed and estimate have agreed for `AGREE_FOR_S` while the
-    vehicle stood at `start`."""
+    vehicle stayed at `start`."""
     end_s = clock() + AGREE_WITHIN_S
     since_s: float | None = None
     while (now_s := clock()) < end_s:
@@ -147,8 +147,8 @@ def _agree(
 
 
 class StandingFeed:
-    """Feed for a vehicle whose standing position defines the world: it stands level at the origin
-    and faces along x. `wait` sends that position `rate_hz` times a second."""
+    """Feed for a vehicle whose position on the ground defines the world: the vehicle is level at
+    x = y = 0 and faces along x. `wait` sends that position `rate_hz` times a second."""
 
     def __init__(
         self, send: SendPosition, ground_z_m: float, rate_hz: float, clock: Callable[[], float]

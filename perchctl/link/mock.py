@@ -182,8 +182,8 @@ class MockLink:
         return None
 
     def close(self) -> None:
-        """Wait until the vehicle no longer flies, with a timeout, and disarm it, as the real link
-        does."""
+        """Wait until the vehicle is no longer flying, with a timeout, and disarm it, as the real
+        link does."""
         end_s = self.now_s + 6.0
         while self.vehicle.firmware.supervisor_info & FLYING and self.now_s < end_s:
             self.advance_to(self.now_s + 0.1)

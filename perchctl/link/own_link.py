@@ -104,7 +104,7 @@ class GuardedLink:
         self._guard, self._on_sent = guard, on_sent
 
     def close(self) -> None:
-        """Wait until the vehicle no longer flies, with a timeout; then disarm it and close the
+        """Wait until the vehicle is no longer flying, with a timeout; then disarm it and close the
         inner link."""
         self._sender.drain(1.0)
         end_s = time.monotonic() + (0.0 if self._answered_s is None else LANDING_WAIT_S)

@@ -12,7 +12,7 @@ from perchctl.mission import SentCommand
 from perchctl.vehicle import Command, ExternalPosition, Telemetry
 
 LANDING_WAIT_S = 6.0
-"""Time for which a closing link waits for a vehicle that still flies, s."""
+"""Time for which a closing link waits for a vehicle that is still flying, s."""
 SentCallback = Callable[[SentCommand], None]
 """Called with each command that a link sends in the loop's place; neither waits nor raises."""
 
@@ -67,7 +67,7 @@ class Link(Protocol):
         """
 
     def close(self) -> None:
-        """Close the link after waiting, with a timeout, until the vehicle no longer flies. A
+        """Close the link after waiting, with a timeout, until the vehicle is no longer flying. A
         vehicle on the ground that does not arm itself is disarmed, however the session ended."""
 
 
@@ -114,7 +114,7 @@ class VehicleLink(Protocol):
         """Return None while the link works, otherwise one sentence with the cause."""
 
     def close(self) -> None:
-        """Disconnect; called when the vehicle no longer flies, after 6 s at the latest."""
+        """Disconnect; called when the vehicle is no longer flying, after 6 s at the latest."""
 
 
 # --- The forms of a vehicle's URI ---

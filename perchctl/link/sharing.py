@@ -79,7 +79,7 @@ IDLE_S = 0.1
 thread ends later. Shorter: the thread takes more processor time."""
 CLOSE_TIMEOUT_S = 3.0
 """Timeout for closing a driver, s; a USB call may take 2 s. Longer: a hanging dongle is reopened
-later. Shorter: the dongle is reopened while the old driver still uses it."""
+later. Shorter: the dongle is reopened while the old driver is still using it."""
 LINGER_S = 5.0
 """Time without any datagram from a flight after which the flight counts as dead, s; an open link
 sends one at least once a second. The hub then drops the flight's packets, and a hub without a

@@ -119,15 +119,15 @@ CLOCK_SKEW = 1e-4
 """Largest rate difference between the two clocks: far larger than between two crystal oscillators,
 far smaller than after a fault."""
 REBOOTED_MS = 1000
-"""Backward step of the stamps above which the vehicle has restarted, ms; reordered packets step
-back by far less."""
+"""Backward step of the stamps above which the vehicle must have restarted, ms; reordered packets
+step back by far less."""
 
 
 class Timebase:
     """Map log time stamps to the loop's clock, using the fastest delivery seen so far.
 
-    The smallest difference between arrival and stamp belongs to the packet that waited least. The
-    difference may grow slowly, to follow a drifting clock. After a restart of the vehicle, the
+    The smallest difference between arrival and stamp belongs to the packet that was delayed least.
+    The difference may grow slowly, to follow a drifting clock. After a restart of the vehicle, the
     mapping restarts at its first stamp; `start` counts the restarts.
     """
 

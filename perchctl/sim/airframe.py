@@ -39,7 +39,7 @@ class Airframe:
         spin_up_s: time from the arming request until its motors turn steadily enough to fly; if
             that takes longer than 2 s, the firmware disarms the vehicle.
         thrust_base: its height controller's guess of the hover thrust, 0..65535.
-        rate_gains: its controller's gains of roll and pitch rate (P, I, D).
+        rate_gains: its controller's gains for roll and pitch rate (P, I, D).
         parameters: firmware parameters that differ from a Crazyflie 2.1's at boot.
     """
 

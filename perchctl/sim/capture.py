@@ -40,7 +40,7 @@ class CaptureFault:
 
     Attributes:
         occluded: the vehicle's body is hidden from the cameras.
-        frozen: all bodies are reported where they were last seen, to the last digit.
+        frozen: all bodies are reported with exactly the pose in which they were last seen.
         gone: no frame is sent.
         swapped: the vehicle's body has swapped names with another body: the one called
             `swapped_with`, or the first other one if that is None.
@@ -67,8 +67,8 @@ class CaptureSettings:
 
     Attributes:
         body: name of the vehicle's rigid body; `body_*`: its pose in body axes.
-        others: (name, position m) of each other rigid body. It stands still unless it is moved
-            (`SimCapture.others_m`).
+        others: (name, position m) of each other rigid body. These bodies do not move unless
+            `SimCapture.others_m` is changed.
         rate_hz: frame rate of the system's cameras.
         delay_s, jitter_s: from an exposure to the frame's arrival, mean and one sigma.
         position_noise_m, attitude_noise_rad: one sigma, each axis.

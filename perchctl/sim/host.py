@@ -207,8 +207,8 @@ def serve_parent(
 
 # --- How time passes in the simulated vehicle's process, and when it ends ---
 # - real time: paced by the wall clock; catches up after a hiccup, never runs ahead. While a flight
-#   sets `SharedTime.limit_s`, it waits for the flight's loop instead;
-# - stepped: only the parent's `advance` moves time; between two calls, packets on the link are
+#   sets `SharedTime.limit_s`, the simulator waits for the flight's loop instead;
+# - stepped: only the parent's `advance` lets time pass; between two calls, packets on the link are
 #   answered, so that cflib can connect while simulated time stands still.
 
 

@@ -42,8 +42,8 @@ class SimProcess:
         uri: address for cflib.
         stream_url: address of the video; "" without a camera.
         capture: the motion-capture system's kind and address for `motioncapture`, or None.
-        shared_time: in real time, the simulated time reached so far and the time up to which the
-            simulation may run.
+        shared_time: with the `pace` "realtime", the simulated time that has been reached, and the
+            time up to which the simulator may advance.
         pid: process ID of the child.
     """
 

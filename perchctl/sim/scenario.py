@@ -82,9 +82,10 @@ class Scenario:
         ground_effect: share of thrust gained with the vehicle on the floor. Recorded take-offs of
             three vehicles needed 0.91 of the thrust with 0 to 3 cm of clearance, and 0.965 with 3
             to 7 cm.
-        thrust_noise: standard deviation of each motor's thrust, as a share, with a memory of 20 ms.
-            With 0.02 the body turns as much above 20 Hz as in 49 recorded flights (0.43 deg/s of
-            roll and pitch, 0.31 to 0.66), and a regression finds the same delay.
+        thrust_noise: standard deviation of each motor's thrust, as a share, with a correlation time
+            of 20 ms. With 0.02 the body's rotation rates above 20 Hz are as large as in 49 recorded
+            flights (0.43 deg/s in roll and pitch, 0.31 to 0.66), and a regression finds the same
+            delay.
         acc_vibration_g: vibration that the running motors add to each axis of the accelerometer
             before its filter: 2.5 times the vibration above 8 Hz in a log, which was 0.003 and
             0.010 to 0.028 g.

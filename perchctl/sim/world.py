@@ -19,9 +19,9 @@ Assumptions of the model, each with its source:
 - Near the ceiling, suction pulls the rotors towards it: at the ceiling itself, the force is their
   thrust times `Scenario.ceiling_suction`; 0.1 was measured on test benches with rotors of this size
   (Hsiao and Chirarattananon, arXiv 1905.04632).
-- The magnet: `Magnet`. The gear's tip is a flat disc, so a held vehicle
-  hangs level and friction keeps the tip in its place: dry friction, without creep under a steady
-  push (MuJoCo's `noslip`).
+- The magnet: `Magnet`. The gear's tip is a flat disc, so a vehicle held by the magnet hangs level,
+  and friction keeps the tip in its place: dry friction, without creep under a steady push (MuJoCo's
+  `noslip`).
 """
 
 from __future__ import annotations
@@ -93,12 +93,12 @@ class World:
 
     @property
     def height_m(self) -> float:
-        """Height of the vehicle above its position when it stands on the floor."""
+        """Height of the vehicle relative to its position when it is standing on the floor."""
         return float(self.z_m - REST_HEIGHT_M)
 
     @property
     def magnet_engaged(self) -> bool:
-        """True if the gear's tip hangs on the magnet."""
+        """True if the magnet is holding the gear's tip."""
         return self.magnet.engaged
 
     @property

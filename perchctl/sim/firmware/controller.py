@@ -243,7 +243,7 @@ class Controller:
 # step in hover loses no height (docs/firmware.md, "Yaw step").
 
 SUPPLY_AT_BOOT_V = 4.2
-SUPPLY_FILTER = 0.01  # weight of each sample, at `SUPPLY_RATE_HZ`
+SUPPLY_FILTER = 0.01  # share of each new sample in the filtered voltage, at `SUPPLY_RATE_HZ`
 SUPPLY_RATE_HZ = 1000.0
 SUPPLY_LEAST_V = 2.0  # a reading below this counts as broken: no thrust
 

@@ -41,8 +41,8 @@ _SAMPLES = 1000.0 * IMU_PERIOD_S  # samples of a real sensor in each mean
 _GYRO_NOISE_RADPS = math.radians(0.1) / math.sqrt(_SAMPLES)
 _ACC_NOISE_MPS2 = 0.01 * GRAVITY_MPS2 / math.sqrt(_SAMPLES)
 _GYRO_LEFT_RADPS = 5e-4
-"""Smallest bias of a real sensor about the level axes: after 12 s of blind flight, a vehicle
-touched down 0.9 m away (docs/firmware.md, "Target covered")."""
+"""Smallest remaining bias of a real gyroscope about the horizontal axes: after 12 s of blind
+flight, a vehicle touched down 0.9 m away (docs/firmware.md, "Target covered")."""
 _PRESSED_MPS2 = 0.03
 """Error of the accelerometer along z while the vehicle is pressed against a ceiling. Without
 positions, the estimated height runs away at 0.1 to 0.2 m/s (docs/firmware.md, "Blind at the

@@ -167,7 +167,7 @@ class Supervisor:
             case State.FLYING | State.LEVEL_OUT if age_s > SILENCE_LEVEL_S + _TICK_S:
                 return State.LEVEL_OUT
             # When levelling out ends, the state returns to FLYING, so `flying` cannot clear while
-            # setpoints are missing: silence after a single stop ends in the lock.
+            # setpoints are missing: silence after a single stop ends with a locked vehicle.
             case State.LEVEL_OUT:
                 return State.FLYING
             case State.FLYING if not flying:
