@@ -43,8 +43,8 @@ much computing time."""
 START_HUNG_S = 60.0
 """Time after which a process that has not sent anything yet is killed, s. On a busy computer,
 loading its libraries takes half a minute, and nothing is armed before all vehicles are ready.
-Longer: the operator waits for a process that hangs while it starts. Shorter: a busy computer cannot
-start a fleet."""
+Longer: the operator waits longer for a process that hangs during its start. Shorter: a busy
+computer cannot start a fleet."""
 LOOP_HUNG_S = 60.0
 """Time without an iteration (turn) of its flight loop after which a process is killed, s. This time
 is longer than a landing by the watchdog takes, including closing the link and the log. Longer: the

@@ -99,8 +99,9 @@ class VehicleView:
 
     @property
     def place_age_s(self) -> float:
-        """Age of the position in the newest status, including all parts that may hang: telemetry,
-        flight loop and process. The age is infinite if one of its parts is unknown."""
+        """Age of the position in the newest status: the sum of the ages of telemetry, loop
+        iteration and message, each of which may stop being renewed. The age is infinite if one of
+        these is unknown."""
         status = self.status
         if status is None or status.telemetry_age_s is None or status.loop_age_s is None:
             return math.inf
@@ -218,8 +219,8 @@ def find_unwatched(plan: FleetPlan, views: Sequence[VehicleView]) -> tuple[str, 
 
 
 def air_places(plan: FleetPlan, views: Sequence[VehicleView]) -> dict[str, Point | None]:
-    """Return the positions, in the room's axes, of all vehicles in the air that measure their
-    position there; None if it is unknown at present."""
+    """Return the position, in the room's axes, of each vehicle in the air that measures its
+    position in these axes; None for a vehicle whose position is currently unknown."""
     places: dict[str, Point | None] = {}
     for view in views:
         vehicle = plan.fleet.vehicle(view.name)

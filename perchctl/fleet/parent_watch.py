@@ -40,7 +40,7 @@ class ParentSwitch(OperatorSwitch):
 
     may_take_off: bool = False
     lost: str | None = None
-    """Why the vehicle lands without the parent's order; otherwise None."""
+    """Why the vehicle is landing without an order from the parent; None if it is not."""
     _newest: Order = field(default_factory=Order)
     _heard: bool = False
     _silent_s: float = 0.0

@@ -7,8 +7,8 @@ The corridor's radius depends on the positioning:
     target alone                                   TARGET_ALONE_M
 
 Two vehicles are in the air together only if their corridors keep the separation and neither takes
-off near the other's corridor. A vehicle that waits on the floor, or that hangs, is an obstacle for
-the others:
+off near the other's corridor. A vehicle that is waiting on the floor, or that is already hanging,
+is an obstacle for the others:
 
     i waits in j's corridor  ->  i flies before j
     i hangs in j's corridor  ->  j flies before i
@@ -61,8 +61,8 @@ START_SEPARATION_M = 0.5
 m, as in Bitcraze's demos. Smaller: a vehicle starts in another one's jet. Larger: homes must be
 farther apart."""
 OBSTACLE_M = 0.24
-"""Minimum distance between a vehicle that waits or hangs and a corridor that is being flown, m:
-twice the radius of 0.12 m that Crazyswarm assumes for a vehicle. Smaller: propellers may touch.
+"""Minimum distance between a vehicle that is waiting or hanging and a corridor that is being flown,
+m: twice the radius of 0.12 m that Crazyswarm assumes for a vehicle. Smaller: propellers may touch.
 Larger: fewer targets fit."""
 
 
@@ -212,8 +212,8 @@ def find_conflicts(
 
 
 def find_precedences(corridors: dict[str, Corridor]) -> tuple[Precedence, ...]:
-    """Return which of two vehicles must fly first, for each pair in which one waits or hangs in the
-    other's corridor."""
+    """Return which of two vehicles must fly first, for each pair in which one would be waiting or
+    hanging in the other's corridor."""
     found = []
     for (name, own), (other, corridor) in itertools.permutations(corridors.items(), 2):
         waits_m, hangs_m = (corridor.distance_to_m(p) for p in (own.home_m, own.target_m))

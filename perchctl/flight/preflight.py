@@ -88,7 +88,7 @@ def refuse_wrong_positions(
         return  # the position is neither checked nor reset
     criteria = GroundCriteria(telemetry, profile)
     stands = criteria.stands
-    # The last position before a problem may have been measured at another place.
+    # The last position before a problem may have been measured while the vehicle was elsewhere.
     sent = status.problem is None and status.age_s <= profile.positioning.hold_s
     if stands and not sent:
         return
@@ -123,10 +123,10 @@ class GroundTurn:
 
 
 def still_waiting_for(turn: GroundTurn) -> str:
-    """Return the conditions that take-off still waits for, in words; empty if the vehicle is ready.
-    Only the current turn counts: if a check passed earlier but fails now, take-off waits for it
-    again. Errors: TimedOut if the wait takes too long, SafetyAbort if the vehicle is not on the
-    ground or is too close to the target."""
+    """Return the conditions that must still be met before take-off, in words; empty if the vehicle
+    is ready. Only the current turn counts: if a check passed earlier but fails now, take-off waits
+    for it again. Errors: TimedOut if the wait takes too long, SafetyAbort if the vehicle is not on
+    the ground or is too close to the target."""
     profile, waited_s, feed = turn.profile, turn.waited_s, turn.feed
     limit_s, by_target = profile.safety.estimator_wait_s, profile.positioning.source.is_target
     if not turn.samples:

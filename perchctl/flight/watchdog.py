@@ -7,10 +7,10 @@ operator's command: it cuts the motors or disarms. After `REPEAT_AFTER_S` of sil
 holds the last position, but never a position above the vehicle, so that the vehicle neither climbs
 nor presses against the ceiling. The exception is a vehicle that is sinking: it keeps a setpoint
 above its own position, which slows its descent. The lander of `perchctl.mission` takes over after
-`safety.loop_late_land_s`, on the operator's command, or if the loop was already descending or had
-put the weight on the magnet. With decks or motion capture, the lander commands the firmware's own
-landing at once, three to six times, because a late loop cannot steer. With the target as the only
-position source, the vehicle descends level.
+`safety.loop_late_land_s`, on the operator's command, or if the vehicle was already descending or
+its weight was already on the magnet. With decks or motion capture, the lander commands the
+firmware's own landing at once, three to six times, because a late loop cannot steer. With the
+target as the only position source, the vehicle descends level.
 """
 
 from __future__ import annotations

@@ -218,7 +218,7 @@ class SimCapture:
         turn, scale = np.eye(3), 1.0
         for fault in faults:
             turn, scale = np.array(fault.axes) @ turn, scale * fault.scale
-        # A motion-capture system defines a body's axes along its own, so a level body has the
+        # A motion-capture system defines a body's axes parallel to its own, so a level body has the
         # identity attitude.
         x, y, z = (scale * float(v) for v in turn @ place)
         if any(fault.mirrored for fault in faults):

@@ -14,8 +14,8 @@
 - Motors of one kind differ (`Scenario.motor_strength`), and the thrust of each fluctuates
   (`Scenario.thrust_noise`): a first-order Gauss-Markov process, independent for each motor.
 - The cell (`Cell`) supplies 4.4 A at full thrust. Current and voltage sag are proportional to
-  thrust: the voltages that docs/firmware.md lists with the duty cycles lie on a line within 0.06 V,
-  with a sag of 0.63 V at full thrust.
+  thrust: the voltages that docs/firmware.md lists with the duty cycles lie within 0.06 V of a
+  straight line, with a sag of 0.63 V at full thrust.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim.airframe import CRAZYFLIE_21, ThrustCurve
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
-# --- One motor's thrust against its voltage, and the inverse that the firmware uses ---
-# The curves are in `perchctl.sim.airframe`. Below the voltage whose thrust is 0 the cubic is
-# negative: the motor stands still (docs/firmware.md, "Thrust to PWM").
+# --- One motor's thrust as a function of its voltage, and the inverse that the firmware uses ---
+# The curves are in `perchctl.sim.airframe`. Below the voltage at which the thrust is 0, the cubic
+# is negative: the motor does not turn (docs/firmware.md, "Thrust to PWM").
 
 
 FULL_COMMAND = 65535.0
@@ -79,7 +79,7 @@ def steady_thrust(curve: ThrustCurve) -> VoltageFunction:
 motor_voltage, thrust_n = inverse_thrust(CRAZYFLIE_21.thrust), steady_thrust(CRAZYFLIE_21.thrust)
 """The thrust functions for the motors of a Crazyflie 2.1."""
 STANDSTILL_V = motor_voltage(0.0)
-"""Voltage up to which the motor stands still (its dead band): 0.45 V."""
+"""Voltage up to which the motor does not turn (its dead band): 0.45 V."""
 
 
 # --- The cell that feeds the motors: charge, resting voltage, resistance, age ---

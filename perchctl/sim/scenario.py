@@ -69,8 +69,8 @@ class Scenario:
         motors_brake: the motors slow down as fast as they speed up at any duty but 0, as recorded
             take-offs show (30 to 50 ms both ways); otherwise they coast whenever they slow down, as
             in the trials.
-        centre_of_mass_m: x and y of the centre of mass, body axes; recorded vehicles were flown
-            as if it were up to 2.4 mm off.
+        centre_of_mass_m: x and y of the centre of mass, body axes; recorded vehicles flew as if
+            their centre of mass were up to 2.4 mm off.
         authority: angular acceleration for a torque, as a share of the data sheet's: the inertia is
             divided by it. Recorded flights show 0.54 (0.41 to 0.69) at 1 to 6 Hz. `thrust_noise`
             explains most of the reduction; the remainder is an assumption.
@@ -79,7 +79,7 @@ class Scenario:
         airspeed_moment_nmspm: moment that lifts the nose in forward flight, and the left side in
             flight to the left, N.m for each m/s. In the same flights, the motors counteract 0.8e-3
             forward and 0.7e-3 sideways.
-        ground_effect: share of thrust gained with the vehicle on the floor. Recorded take-offs of
+        ground_effect: share of thrust that the vehicle gains on the floor. Recorded take-offs of
             three vehicles needed 0.91 of the thrust with 0 to 3 cm of clearance, and 0.965 with 3
             to 7 cm.
         thrust_noise: standard deviation of each motor's thrust, as a share, with a correlation time

@@ -240,7 +240,7 @@ def pixel_slices(box: Box, margin_px: int = 0) -> tuple[slice, slice]:
 
 
 def neighbour_sheet(neighbour: Neighbour, own: TargetConfig) -> PlacedSheet:
-    """Return the sheet of another vehicle's target. An id of None stands for the id in the
+    """Return the sheet of another vehicle's target. An id of None means the corresponding id of the
     vehicle's own target."""
     large = {} if neighbour.large_id is None else {"id": neighbour.large_id}
     small = {} if neighbour.small_id is None else {"id": neighbour.small_id}

@@ -186,7 +186,8 @@ class World:
         velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0),
         hold: bool = False,
     ) -> None:
-        """Put the vehicle into a pose without rotation rates; `hold` keeps it there until `let_go`.
+        """Put the vehicle into a pose with zero rotation rates; `hold` keeps it there until
+        `let_go`.
 
         The gyroscope does not sense the change of pose.
         """

@@ -136,8 +136,8 @@ class Estimator:
     ) -> None:
         """Advance by one control period.
 
-        The drift runs once the vehicle `has_flown`. `spinning` motors shake the accelerometer, and
-        a vehicle `pressed` against the ceiling biases it. `flying` is the supervisor's state.
+        The estimate drifts once the vehicle `has_flown`. `spinning` motors shake the accelerometer,
+        and a vehicle `pressed` against the ceiling biases it. `flying` is the supervisor's state.
         """
         if len(self._white) < 12:
             self._white = self._rng.standard_normal(_NOISE_BATCH).tolist()
