@@ -180,9 +180,7 @@ class _Seat:
                 on_sample=self._wait,
                 others=self._room.others_of(self.name) or None,
             )
-        except (
-            ConnectionFailed
-        ) as error:  # for example, because motion capture does not see the vehicle
+        except ConnectionFailed as error:  # if motion capture does not see the vehicle, for example
             return refused_vehicle(str(error))
         self._room.bodies[self.name].follow(flight.vehicle)
         return flight.fly()
