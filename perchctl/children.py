@@ -25,12 +25,12 @@ _PREFACE = "import sys; sys.path.append(sys.argv[1]); "
 
 
 class SharedTime(ctypes.Structure):
-    """Simulated time in memory shared by both processes: how far it has advanced (`reached_s`, set
-    by the simulator) and how far it may advance (`limit_s`, set by the flight; infinity means no
-    limit)."""
+    """The clock of a simulation, in memory shared by both processes: the simulated time reached so
+    far (`reached_s`, set by the simulator), and the simulated time at which the simulator must wait
+    for the flight (`limit_s`, set by the flight; infinity means no limit)."""
 
     MARGIN_S: ClassVar = 0.02
-    """How far simulated time may advance beyond the time for which the flight loop waits, s."""
+    """How far the simulator may run ahead of the time until which the flight loop is waiting, s."""
 
     reached_s: float
     limit_s: float

@@ -5,7 +5,7 @@ The conventions (all of them are in `docs/conventions.md`):
 - ``T_a_b`` is a 4x4 homogeneous matrix that maps coordinates in b into a, so
   inner letters cancel: ``T_world_body @ T_body_cam @ T_cam_target``.
 - world and body: x forward, y left, z up. level: body with roll and pitch
-  taken out. cam: OpenCV (x right, y down, z along the view).
+  removed. cam: OpenCV (x right, y down, z along the view).
 - Roll, pitch and yaw are right-handed rotations about body x, y, z:
   ``R_world_body = Rz(yaw) Ry(pitch) Rx(roll)``. Positive pitch is nose
   *down*; a Crazyflie's own `stateEstimate.pitch` is nose up and is negated in

@@ -52,7 +52,7 @@ def fly(
     """Fly once in real time, with the checks, planner, watchdog and log of `perchctl fly --yes`.
     **It arms the vehicle without asking.** Ctrl-C works if you call this function in the main
     thread. Press Ctrl-C to land. Press it again to cut the motors. Warnings from the checks, and an
-    incomplete log, are Python warnings (`perchctl.errors.Note`).
+    incomplete log, are reported as Python warnings (`perchctl.errors.Note`).
 
     Args:
         profile: a profile, its name, or its file.
@@ -139,8 +139,9 @@ class _OnEvent(Watcher):
 
 class _Stopper:
     """Calls `should_stop` and commands the landing. Runs in the loop's own thread, because the
-    watchdog's thread must not hang in user code. If the function raises an exception, the vehicle
-    lands, because the answer may have been yes; the function is not called again."""
+    watchdog's thread must not be blocked by user code. If the function raises an exception, the
+    vehicle lands, because the function may have been about to return True; it is not called
+    again."""
 
     def __init__(self, should_stop: Callable[[], bool], switch: OperatorSwitch) -> None:
         self._should_stop, self._switch = should_stop, switch

@@ -85,7 +85,7 @@ class Telemetry:
 
 
 FRESH_S = 0.3
-"""Age above which telemetry no longer shows whether the motors run, s."""
+"""Age above which telemetry no longer shows whether the motors are running, s."""
 
 
 def is_fresh(newest: Telemetry | None, now_s: float) -> bool:
@@ -108,8 +108,8 @@ def may_be_flying(newest: Telemetry | None, now_s: float) -> bool:
 
 
 def is_disarmed(newest: Telemetry) -> bool:
-    """True if the vehicle waits for an arming request: it does not arm itself, its motors are off,
-    and nothing else prevents flight (docs/firmware.md, "Arming")."""
+    """True if the vehicle is waiting for an arming request: it does not arm itself, its motors are
+    off, and nothing else prevents flight (docs/firmware.md, "Arming")."""
     return newest.has_bit(CAN_ARM) and not newest.has_bit(ARMED | AUTO_ARM)
 
 

@@ -1,8 +1,8 @@
 """Replay the decisions of a flight: pass the recorded observations to the planner again.
 
-The planner is pure, so the same observations and the same profile must give the same commands. They
-are bit-identical on the computer that flew, and within a tolerance on any other, whose libraries
-may round differently. A turn is one iteration of the flight loop.
+The planner is pure, so the same observations and the same profile must give the same commands. The
+commands are bit-identical on the computer that ran the flight, and equal within a tolerance on any
+other, whose libraries may round differently. A turn is one iteration of the flight loop.
 """
 
 from __future__ import annotations

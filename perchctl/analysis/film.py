@@ -27,8 +27,8 @@ ARM_M = 0.046
 BESIDE_M, ABOVE_M = 0.25, 0.12
 """Margins in the side view, to the left and right of the flight and above it, m."""
 LEAST_ASIDE_M = 0.05
-"""If the start is horizontally closer to the target than this, m, it does not define the direction
-of the view."""
+"""If the take-off point is horizontally closer to the target than this, m, it does not define the
+direction of the side view."""
 LAST_PICTURE_S = 2.0
 """How long the last image stays on screen, s."""
 WIDTH_IN, HEIGHT_IN = 9.6, 5.4
@@ -240,7 +240,7 @@ def side_path_and_target_height(flight: FlightAnalysis) -> tuple[Array, float | 
     if not seen_m.size:
         return place_m, None
     target_z_m = float(target_m[2] - start_m[2])
-    # The vehicle cannot be above the sheet, but its estimate drifts while it hangs there.
+    # The vehicle cannot be above the sheet, but its estimate drifts while it is hanging there.
     highest_m = target_z_m - log.flown_profile.vehicle.gear_body_m[2]
     place_m[:, 1] = np.minimum(place_m[:, 1], highest_m)
     return place_m, target_z_m

@@ -107,8 +107,9 @@ class FlightAnalysis:
     `column(field)` returns one field for all ticks, (n,), NaN where it is missing.
 
     Times are measured from the first iteration in which the vehicle was flown. A property
-    that meets an invalid value in the log raises InvalidValue, TypeError, ValueError, LookupError
-    or AttributeError; within `perchctl.record.wrap_log_errors` all of these become InvalidValue.
+    that encounters an invalid value in the log raises InvalidValue, TypeError, ValueError,
+    LookupError or AttributeError; within `perchctl.record.wrap_log_errors` all of these become
+    InvalidValue.
     """
 
     def __init__(self, log: FlightLog) -> None:

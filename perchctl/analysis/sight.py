@@ -66,8 +66,8 @@ def read_frames(log: FlightLog) -> Frames:
     ages_s = np.array([r["t_s"] - r["frame_t_s"] for r in records], dtype=np.float64)
     age_s, gaps_s = percentile(ages_s, 50), np.empty((0, 2))
     if records:
-        # The last gap may end with the flight: there, the newest possible exposure is the flight's
-        # end minus the usual age of a frame.
+        # The last gap may end with the flight. In that case, the newest possible exposure is the
+        # flight's end minus the usual age of a frame.
         gaps_s = _gaps(log, np.append(times_s, max(log.end_s - age_s, times_s[-1])))
     between_s = np.diff(np.sort(times_s))
     return Frames(
@@ -98,7 +98,8 @@ def _gaps(log: FlightLog, times_s: Array) -> Array:
 # --- losses ---
 
 LEAST_LOSS_S = 0.3
-"""Duration below which the filter bridges a loss, so that it has no effect, s."""
+"""Duration below which the filter bridges a loss of the target, so that the loss has no effect,
+s."""
 NEEDED_IN = frozenset({"ESTIMATE", "ALIGN", "ASCEND", "PERCH", "RECOVER", "HOVER"})
 AT_THE_CEILING = frozenset({"COMPLETE", "PERCHED"})
 
@@ -151,7 +152,7 @@ def _end_of_loss(start_s: float, end_s: float, stays: Sequence[PhaseSpan]) -> fl
     )
     if left is not None and left.phase in AT_THE_CEILING and left.start_s <= end_s:
         if phase == "PERCH":
-            return None  # expected: no marker fits into the image this close
+            return None  # expected: at this distance, no marker fits into the image
         end_s = left.start_s
     if phase not in NEEDED_IN or (left is not None and left.start_s - start_s < LEAST_LOSS_S):
         return None

@@ -2,8 +2,8 @@
 
 The thrust f_i that the firmware demands from each motor follows from the motor's duty cycle, the
 battery voltage and the thrust curve. A weak motor delivers less thrust than the firmware demands.
-The shares a_i = 4 f_i / (f_1 + f_2 + f_3 + f_4) have the mean 1 and, on an X frame whose motors are
-`MOTOR_OFFSET_M` to the front and to the side, three patterns:
+The shares a_i = 4 f_i / (f_1 + f_2 + f_3 + f_4) have a mean of 1 and, on an X frame whose motors
+are `MOTOR_OFFSET_M` to the front and to the side, three patterns:
 
     M4 front left    M1 front right      pitch = (a_1 + a_4 - a_2 - a_3) / 4
                \\    /                    roll  = (a_3 + a_4 - a_1 - a_2) / 4
@@ -157,7 +157,8 @@ def estimate_trim(log: FlightLog, *, simulated: bool = False) -> Trim | None:
     duties = np.stack([log.column(f"duty_m{motor}") for motor in (1, 2, 3, 4)], axis=1)
     volts = log.column("battery_v")
     is_known = np.all(duties <= MOST_DUTY, axis=1) & (volts <= MOST_CELL_V)
-    # Each tick contains the newest packet, so successive identical numbers come from one packet.
+    # Each tick contains the newest packet, so successive ticks with identical duty cycles contain
+    # the same packet.
     is_new = np.any(np.diff(duties, axis=0, prepend=np.nan) != 0.0, axis=1)
     packets = np.flatnonzero(is_known & is_new)
     motor_v = duties[packets] / MOST_DUTY * volts[packets, np.newaxis]

@@ -502,7 +502,7 @@ def _distortion(found: _Found, named: str | None) -> tuple[str, NDArray[np.float
     given = _numbers(key, value)
     model = named
     if model is None:
-        if given.size == 4 and "fisheye" not in found:  # OpenCV writes that key as 0 or 1
+        if given.size == 4 and "fisheye" not in found:  # OpenCV writes a fisheye flag, 0 or 1
             raise InvalidValue(
                 f"{key} has 4 numbers, which plumb_bob and fisheye both have: add "
                 f"distortion_model with plumb_bob or equidistant"

@@ -67,7 +67,7 @@ def configure_capture(
 
 class DeviceSource(LiveSource):
     """A camera connected to this computer. Only the newest frame is kept; its time stamp is the
-    time at which the grab returns.
+    time at which OpenCV's `grab` returns.
 
     Bad images are dropped. After `LOST_AFTER_FAILURES` successive bad images or failed reads, the
     camera counts as lost: it is released, and reopened once it is available again. `opener`

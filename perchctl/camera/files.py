@@ -1,4 +1,4 @@
-"""Recorded frames: ``video:FILE`` and ``images:DIR``. Every frame is returned; none is dropped."""
+"""Recorded frames: ``video:FILE`` and ``images:DIR``. No frame of a recording is dropped."""
 
 from __future__ import annotations
 

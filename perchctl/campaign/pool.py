@@ -66,5 +66,5 @@ def defer_interrupts() -> Iterator[None]:
         for name, handler in handlers.items():
             signal.signal(name, handler or signal.SIG_DFL)
         for number in came:
-            signal.raise_signal(number)  # the signal mask defers it until the next line
+            signal.raise_signal(number)  # deferred by the signal mask until the next line
         signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -210,8 +210,8 @@ PICTURES: dict[str, Callable[[Rehearsal, Profile], Finding]] = {
 
 
 def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Finding:
-    """Check that the target is in view from where the vehicle stands and during the climb. The row
-    fails if `fly` would refuse the flight."""
+    """Check that the target is in view from the vehicle's position on the ground and during the
+    climb. The row fails if `fly` would refuse the flight."""
     if not rehearsal.target_pictures:
         where = overhead_text(profile.target, camera, profile.camera.mount)
         return failed(
@@ -226,7 +226,7 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
     if problem := GroundCriteria.moved_body(rehearsal.target_moved_m, profile):
         return failed(problem.found, problem.advice)
     feet = (0.0, 0.0, profile.safety.ground_z_m)
-    # World frame: the vehicle stands level at the origin and faces along x.
+    # World frame: the vehicle is level, at the origin, and faces along x.
     gear_m = np.asarray(profile.vehicle.gear_body_m)
     place = Place(np.array(feet) + rehearsal.target.e_m + gear_m, rehearsal.target.e_yaw_rad)
     problem = view_problem(place, feet, 0.0, profile, camera)

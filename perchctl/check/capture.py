@@ -129,7 +129,7 @@ def failed_capture_rows(error: PerchError, config: PositioningConfig) -> list[Ro
 
 
 def mocap_rows_at_rest(samples: CaptureSamples, profile: Profile) -> list[Row]:
-    """Check samples from a motion-capture system that were taken while the vehicle stood still."""
+    """Check samples from a motion-capture system that were taken while the vehicle was at rest."""
     config = profile.positioning
     if not samples.frames:
         error = samples.error or PerchError(f"{config.label} sends no frames")

@@ -39,7 +39,7 @@ from perchctl.vehicle import DISARM_IT, FLYING, Telemetry
 from perchctl.vision import CameraModel, make_pipeline
 
 BODY_AT_HOME_M = 0.25
-"""Distance from a home within which a body counts as standing there, m: half the smallest distance
+"""Distance from a home within which a body counts as being there, m: half the smallest distance
 between a home and another vehicle's corridor. Larger: neighbours that have swapped places may pass.
 Smaller: homes measured by tape fail."""
 DARK_SHARE = 0.5
@@ -54,7 +54,7 @@ Ask = Callable[[str], bool]
 
 @dataclass(frozen=True, kw_only=True)
 class Stand:
-    """Where one vehicle of several stands on the floor. All positions and the heading are in the
+    """Where one of several vehicles is on the floor. All positions and the heading are in the
     axes of its own state estimate.
 
     Attributes:
@@ -183,7 +183,7 @@ def _body_finding(
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What the camera sees, assuming that the vehicle stands at its home."""
+    """What the camera sees, assuming that the vehicle is at its home."""
 
     link: ProbeLink
     source: FrameSource

@@ -108,7 +108,7 @@ class Rehearsal:
 @dataclass(frozen=True)
 class _TelemetryOnly:
     """Stand-in for a link that only returns telemetry. If `feet_m` is given, the vehicle is assumed
-    to stand there, because its estimate diverges if it is sent no positions."""
+    to be at that position, because its own estimate diverges if it is sent no positions."""
 
     take: TakeTelemetry
     feet_m: tuple[float, float, float] | None

@@ -277,7 +277,7 @@ def _estimator(vehicle: VehicleStatus, profile: Profile) -> Finding:
     if not profile.positioning.source.is_deck:
         if not vehicle.position_decks(profile):
             return skipped(BY_FLY)
-        judged = profile.with_({"positioning.by": "deck"})  # only fly sends positions
+        judged = profile.with_({"positioning.by": "deck"})  # only perchctl fly sends positions
     criteria = GroundCriteria(t, judged, vehicle.decks)
     problem = criteria.estimate_unsettled
     if problem is not None:

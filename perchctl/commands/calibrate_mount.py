@@ -219,7 +219,7 @@ def _record_live(
         uri: the vehicle's URI; None to connect to no vehicle. view: serve the live page.
 
     Raises:
-        Interrupted: the user pressed Ctrl-C. SafetyAbort: the motors turn.
+        Interrupted: the user pressed Ctrl-C. SafetyAbort: the motors are turning.
         The errors of `open_camera`, `AttitudeLink.connect` and `record_mounting`.
     """
     from perchctl.commands.progress import guidance_display
@@ -270,7 +270,7 @@ def _record_live(
 @contextlib.contextmanager
 def _vehicle(uri: str, profile: profiles.Profile) -> Iterator[Sensors]:
     """Connect to the vehicle, and yield two functions that return its samples and its problem.
-    Raises SafetyAbort if its motors turn or may turn."""
+    Raises SafetyAbort if its motors are turning or may start to turn."""
     link = links.AttitudeLink(uri, profile.link, time.monotonic)
     say(f"connecting to {uri} (read-only)")
     link.connect()

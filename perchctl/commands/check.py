@@ -84,7 +84,7 @@ def check(
 
     Each check passes, warns, fails, or is skipped if perchctl cannot find out. perchctl does
     not arm the vehicle, and no motor turns. The exit code is 0 if no check fails, 10 if the vehicle
-    does not answer, 20 if the camera gives no image, and 52 if any other check fails.
+    does not answer, 20 if the camera delivers no images, and 52 if any other check fails.
     """
     if cameras:
         say_on_terminal("listing the cameras")

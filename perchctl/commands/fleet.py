@@ -201,8 +201,9 @@ def fly(
     """Fly all vehicles of a fleet in the order of the plan, each one in its own process.
 
     No vehicle is armed until all of them are ready. Press Ctrl-C to land all vehicles except
-    those that hang. Press it again to cut the motors. The space bar cuts the motors at once. To
-    land a single vehicle, press its number. The exit code is 0 only if all vehicles hang.
+    those that are hanging. Press it again to cut the motors. The space bar cuts the motors at once.
+    To land a single vehicle, press its number. The exit code is 0 only if all vehicles are hanging
+    at the end.
     """
     _say_reading(file)
     loaded = fleets.load_fleet(file or fleets.EXAMPLE_FLEET)

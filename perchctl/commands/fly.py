@@ -222,8 +222,8 @@ def fly_and_report(
             detached = report.detached_watchers
         except BaseException as error:
             detached = tuple(getattr(error, "__notes__", ()))
-            # End the page first: a hanging disk can delay closing the log, and meanwhile the Land
-            # button would seem active.
+            # End the page first: a disk that does not respond can delay closing the log, and
+            # meanwhile the Land button would seem active.
             if page is not None:
                 page.fail(error, log.path if log.has_begun else None)
             log.abandon(str(error) or type(error).__name__)

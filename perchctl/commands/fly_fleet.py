@@ -38,7 +38,7 @@ DISPLAY_PERIOD_S = 0.1
 ENDING_TIMEOUT_S = 90.0
 """Time for vehicles to land and their processes to end after a failure of the parent, s. This time
 is longer than a landing and the closing of link and log take together. Shorter: a process may be
-ended while its vehicle still flies. Longer: a failed command ends later."""
+ended while its vehicle is still flying. Longer: a failed command ends later."""
 NUMBER_KEYS = 9
 """Number of vehicles that can be landed with a number key."""
 
@@ -357,8 +357,8 @@ class FleetSession:
             self._panel.show([_row(number, view) for number, view in views])
 
     def _show_page(self, coordinator: fleets.Coordinator) -> None:
-        """Show the coordinator's newest data on the page. If the coordinator hangs, the page shows
-        how old the data is."""
+        """Show the coordinator's newest data on the page. If the coordinator stops responding, the
+        page shows how old the data is."""
         if self._page is not None and coordinator.rounds != self._shown_round:
             self._shown_round = coordinator.rounds
             rows = [_row(number, view) for number, view in enumerate(coordinator.views, 1)]
@@ -413,7 +413,7 @@ class FleetSession:
 
     def _end(self, error: BaseException) -> None:
         """Land all flying vehicles, and wait until their processes have ended. After an emergency
-        stop by the operator, do not wait for processes that hang."""
+        stop by the operator, do not wait for processes that do not respond."""
         self._switch.land()
         hung = isinstance(error, Interrupted) and self._switch.listening
         if self._panel is not None and not (hung or all(map(_has_ended, self._children.values()))):

@@ -24,7 +24,7 @@ def say(sentence: str) -> None:
 
 def say_on_terminal(sentence: str) -> None:
     """Print what the command is about to do, because loading libraries then takes a second or more.
-    Print only on a terminal: nobody waits in front of a pipe or a file."""
+    Print only on a terminal: nobody is watching a pipe or a file."""
     with contextlib.suppress(OSError, ValueError):
         if sys.stderr.isatty():
             say(sentence)

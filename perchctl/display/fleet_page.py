@@ -23,8 +23,8 @@ EVENTS_SHOWN = 200
 """Number of event lines on the page. Larger: the browser receives more data. Smaller: a page that
 is opened late does not show the beginning of a long flight."""
 PICTURE_TIMEOUT_S = 0.5
-"""Timeout for a vehicle's process to deliver an image, s. Longer: a hanging process delays the
-other tiles. Shorter: images are missing if the computer is busy."""
+"""Timeout for a vehicle's process to deliver an image, s. Longer: a process that does not respond
+delays the other tiles. Shorter: images are missing if the computer is busy."""
 LARGEST_PICTURE_BYTES = 2_000_000
 """Largest JPEG, bytes. Larger: invalid data could fill the memory. Smaller: large images are not
 shown."""

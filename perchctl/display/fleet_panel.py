@@ -30,7 +30,8 @@ class FleetRow:
 
     Attributes:
         link_s: age of the newest telemetry.
-        has_ended: its flight is over; hangs: it is over, and the vehicle hangs with its motors off.
+        has_ended: its flight is over.
+        hangs: its flight is over, and the vehicle is hanging with its motors off.
         is_silent: its process has not sent anything for too long.
         picture_port: local port at which its process serves its images.
     """

@@ -69,16 +69,16 @@ class LivePage(Page):
 
     @property
     def _is_fresh(self) -> bool:
-        """True while images arrive."""
+        """True while images are arriving."""
         return self._clock() - self._picture_s < _PICTURE_STALE_S
 
     def state(self) -> dict[str, Any]:
-        """The result of `Page.state`, with the additional key ``fresh``: True while images
-        arrive."""
+        """The result of `Page.state`, with the additional key ``fresh``: True while images are
+        arriving."""
         return super().state() | {"fresh": self._is_fresh}
 
     def picture(self, name: str) -> bytes | None:
-        """The newest image; None if no images arrive. `name` is not used."""
+        """The newest image; None if no images are arriving. `name` is not used."""
         newest = self.jpeg_after(0) if self._is_fresh else None
         return None if newest is None else newest[1]
 

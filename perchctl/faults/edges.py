@@ -192,7 +192,7 @@ class FaultyCamera(WrappedSource):
 
 
 USER_PATIENCE_S = 60.0
-"""Time after which the user kills a program that hangs, s."""
+"""Time after which the user kills a program that does not respond, s."""
 
 
 class ProgramKilled(BaseException):

@@ -17,8 +17,8 @@ from perchctl.faults.truth import Facts
 # after a slip below this height, the vehicle hits the floor (docs/firmware.md, "Catching a slip")
 CATCHABLE_M = 1.0
 NOTICED_S = 1.5
-"""Time within which the program must accept a low battery reading, s. Larger: a late landing is
-excused."""
+"""Time within which the program must recognise that the battery is low, s. Larger: a late landing
+is excused."""
 FASTEST_LANDING_MPS = 0.4
 """Highest speed of a landing, m/s. Smaller: a slow landing is excused."""
 PUSHED_OFF_S = 0.2

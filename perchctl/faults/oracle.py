@@ -14,9 +14,9 @@ from typing import NamedTuple
 from perchctl.mission import Event, FlightReport, Outcome, Phase, RestState
 
 Claim = str
-"""A claim that `Oracle._is_true` can verify. A claim of hanging or standing implies that the motors
-are off. `not seen down` claims that no telemetry has shown the vehicle at rest with its motors
-off."""
+"""A claim that `Oracle._is_true` can verify. A claim that the vehicle hangs or stands implies that
+its motors are off. `not seen down` claims that no telemetry has shown the vehicle at rest with its
+motors off."""
 Flag = str
 FLAGS: dict[Flag, str] = {
     "crashed": "perchctl ended with an exception that no fault injected",
@@ -81,7 +81,7 @@ that they command need not be obeyed."""
 
 
 class Sample(NamedTuple):
-    """The vehicle's true state at one time, in SI units; a standing vehicle has height 0."""
+    """The vehicle's true state at one time, in SI units; a vehicle on the floor has height 0."""
 
     t_s: float
     x_m: float
@@ -178,9 +178,9 @@ class Oracle:
         self._max_height_m, self._magnet_radius_m = max_height_m, magnet_radius_m
         self._tilted_up_z = math.cos(math.radians(max_tilt_deg))
         self._tilt_up_z = math.cos(math.radians(max_tilt_deg - TILT_WITHIN_DEG))
-        self._hung: Sample | None = None  # last sample in which the vehicle hung
+        self._hung: Sample | None = None  # last sample in which the vehicle was hanging
         self._unpowered, self._weightless = _Lasting(OFF_S), _Lasting(WEIGHTLESS_S)
-        self._press_s = -math.inf  # time of the newest sample in which the vehicle pressed
+        self._press_s = -math.inf  # time of the newest sample in which the vehicle was pressing
         self._pressed = _Lasting(PRESSED_S)
         self._calm_height_m = 0.0  # height when the vehicle was last not sinking fast
         self._fall: _Fall | None = None
@@ -236,7 +236,7 @@ class Oracle:
 
     @property
     def is_airborne(self) -> bool:
-        """True if the vehicle flies or falls."""
+        """True if the vehicle is flying or falling."""
         s = self.newest
         return s is not None and _airborne(s) and not (s.hanging and not s.motors_on)
 
@@ -244,7 +244,7 @@ class Oracle:
         self.flags.setdefault(flag, t_s)
 
     def _from_hanging(self, s: Sample) -> bool:
-        """True if the vehicle hung at most `FROM_HANGING_S` ago."""
+        """True if the vehicle was hanging at most `FROM_HANGING_S` ago."""
         return self._hung is not None and s.t_s - self._hung.t_s <= FROM_HANGING_S
 
     def _watch_unpowered(self, s: Sample) -> None:
@@ -325,7 +325,7 @@ class Oracle:
     def _is_true(self, claim: Claim, s: Sample) -> bool:
         hangs = s.hanging and not s.motors_on
         off_m = math.hypot(s.miss_m, s.below_m)
-        # A vehicle that lies on its side or its back does not count as standing.
+        # A vehicle that is lying on its side or its back does not count as standing.
         stands = not s.motors_on and not _airborne(s) and s.body_up_z > self._tilted_up_z
         truths = {
             "hangs on the target": hangs and s.miss_m <= self._magnet_radius_m,
@@ -395,8 +395,8 @@ OUTCOME_CLAIMS: dict[Outcome, Claims] = {
 }
 """The claims implied by the meaning of each outcome's exit code (`perchctl.errors.EXIT_CODES`)."""
 NOT_KNOWN, UNCONFIRMED = "hangs-or-stands", "landing-timeout"
-"""Two transitions that end a flight while perchctl does not know whether the vehicle hangs or
-stands, or whether it came down at all."""
+"""Two transitions that end a flight while perchctl does not know whether the vehicle is hanging
+or on the floor, or whether it came down at all."""
 RESCUE_CLAIMS: dict[RestState, Claims] = {
     RestState.STANDS: {"stands"},
     RestState.HANGS: {"hangs"},

@@ -100,10 +100,11 @@ LOCKS_S = 0.1
 """Time from the cut until the lock shows, s. Packets that arrive in this time cannot prevent the
 lock."""
 TOPPLES_S, TOPPLED_UP_Z = 0.3, 0.5
-"""Time within which stopped motors cannot have regained control, s, and the tilt beyond which the
-vehicle has turned over in this time, as the z component of its body's z axis."""
+"""Time after a slip within which a vehicle whose motors were stopped cannot have regained control,
+s, and the tilt beyond which it has turned over in this time, as the z component of its body's z
+axis."""
 WATCH_WITHIN_S = 0.1
-"""Longest delay until the telemetry shows that a vehicle hangs, s."""
+"""Longest delay until the telemetry shows that a vehicle is hanging, s."""
 
 
 @dataclass
@@ -117,7 +118,7 @@ class Facts:
         was_landing_onboard: True if the onboard landing was under way when that silence
             began.
         killed_s: when the program was killed.
-        rebooted_s: when the vehicle rebooted in the air while its motors turned.
+        rebooted_s: when the vehicle rebooted in the air while its motors were turning.
         stop_s: when the operator's key presses commanded the emergency stop.
         magnet_failed_s: when the magnet failed permanently; `hung_through_watch`: by then, the
             whole weight had hung on the magnet with the motors off for as long as the program

@@ -1,9 +1,10 @@
 """The result of comparing a motion-capture system with the vehicle, which is lifted by hand
 (`perchctl check --lift`), stored for `fly`.
 
-Swapped axes cannot be detected while a vehicle stands as it did when its rigid body was defined,
-but only when it is lifted and rotated by hand. Each comparison is therefore stored for its vehicle
-and set-up, and a flight requires one that passed at most `VALID_S` ago.
+Swapped axes cannot be detected while a vehicle is in the orientation in which its rigid body was
+defined. They can only be detected when it is lifted and rotated by hand. Each comparison is
+therefore stored for its vehicle and set-up, and a flight requires one that passed at most `VALID_S`
+ago.
 """
 
 from __future__ import annotations

@@ -210,8 +210,8 @@ class PositionFeed:
             self._turned_s, self._problem = now_s, problem
 
     def sent_pose(self) -> VehiclePose | None:
-        """Return the newest pose that was sent, even if only its position was; None before the
-        first."""
+        """Return the newest pose that was sent, even if only its position was sent; None before the
+        first one."""
         return self._placed
 
     def status(self, now_s: float) -> FeedStatus:

@@ -2,8 +2,8 @@
 position in a world fixed to the target, add the motion of the vehicle's estimate since the
 exposure, and send the result to its estimator.
 
-The origin of this world frame is the place on the ground where the vehicle stands when its estimate
-is reset. The world's origin is sent until the target has been seen often enough from there; then
+The origin of this world frame is the vehicle's position on the ground when its estimate is
+reset. The world's origin is sent until the target has been seen often enough from there; then
 the target's position is fixed. Ground, safety limits and heights therefore keep their meaning.
 
 No exposure is used twice, out of order, or when it is older than `OLDEST_S`. A position is rejected
@@ -109,13 +109,13 @@ class TargetFeed:
         self._refusal, self._beside_m = "", 0.0
 
     def send_origin(self, now_s: float) -> None:
-        """Send the world's origin while the vehicle stands and no target is known yet."""
+        """Send the world's origin while the vehicle is on the ground and no target is known yet."""
         if self.target is None:
             self.send_known(self._origin_m, now_s)
 
     def send_known(self, position_m: tuple[float, float, float], now_s: float) -> None:
-        """Send a position that is known without an image, because the vehicle stands, hangs or is
-        in contact with the ceiling."""
+        """Send a position that is known without an image, because the vehicle is on the ground,
+        hanging, or in contact with the ceiling."""
         self._hand_over(ExternalPosition(position_m), now_s, now_s)
 
     def contact_position(self, yaw_rad: float) -> tuple[float, float, float] | None:

@@ -158,7 +158,8 @@ def replace_values(text: str, values: Mapping[str, Value]) -> str:
     stream = io.StringIO()
     yaml.dump(document, stream)
     written = stream.getvalue()
-    if _values_of(written) != wanted:  # differs, for example, if another key refers to an anchor
+    # the written values differ, for example, if another key refers to an anchor
+    if _values_of(written) != wanted:
         raise ValueError("the values cannot be written into this file's layout")
     return written
 

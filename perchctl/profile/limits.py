@@ -57,7 +57,8 @@ class Limit:
 
 
 def _read(found: re.Match[str]) -> str:
-    """Convert a profile's key to an expression; a measured latency becomes its initial value."""
+    """Convert a profile's key to an expression; `camera.latency_s`, which may be ``measured``, is
+    replaced by the latency at the start of the flight."""
     key = found[0]
     return f"profile.{'camera.start_latency_s' if key == 'camera.latency_s' else key}"
 

@@ -41,7 +41,7 @@ class EstimateConfig(Section):
 
 
 class AlignConfig(Section):
-    """Phase 4. Errors must stay within tolerance for `dwell_s`."""
+    """Phase 4. Position and heading errors must stay within tolerance for `dwell_s`."""
 
     xy_m: float = key(
         0.04, "maximum distance of the gear from the target's axis to count as aligned", gt=0, le=1
@@ -141,8 +141,8 @@ class CompleteConfig(Section):
     In the first stage, the position setpoint is lowered in `steps` steps within `release_s`; the
     magnet must hold for `hold_dwell_s` with the thrust below `hold_ratio` of the hover thrust. In
     the second stage, setpoints of raw thrust decrease to zero within `ramp_s`, until the motors
-    stand still; the whole weight must then hang for `hang_s`. The vehicle is monitored for
-    `watch_s` after the motors have been stopped.
+    stop turning; the whole weight must then hang on the magnet for `hang_s`. The vehicle is
+    monitored for `watch_s` after the motors have been stopped.
     """
 
     steps: ClassVar[int] = 5
@@ -158,7 +158,7 @@ class CompleteConfig(Section):
     ramp_s: ClassVar[float] = 0.5
     """Time in which the raw thrust decreases from the minimum of position mode to zero, s."""
     hang_s: ClassVar[float] = 1.0
-    """Time for which the whole weight must hang before the motors stop, s."""
+    """Time for which the whole weight must hang on the magnet before the motors are stopped, s."""
     release_timeout_s: ClassVar[float] = 8.0  # time after which the attempt counts as failed
     slip_m: ClassVar[float] = 0.03  # largest distance below the contact that counts as hanging
     slip_mps: ClassVar[float] = 0.12  # sink rate that counts as a slip
@@ -368,6 +368,6 @@ class SafetyConfig(Section):
     )
     start_tilt_deg: ClassVar[float] = 10.0
     """Roll or pitch above which take-off is refused, deg."""
-    # time for which the vehicle may press without moving before it backs off downwards
+    # time for which the vehicle may press against an obstacle before it backs off downwards
     blocked_s: ClassVar[float] = 0.7
     land_on_log_error: bool = key(False, "land if the log cannot be written")

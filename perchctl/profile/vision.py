@@ -99,8 +99,8 @@ class Mounting(Section):
 
 
 def _eighths(angle: float) -> int:
-    """Return the number of eighths of a turn that the angle is if it is in radians with two
-    decimals or more; otherwise 0."""
+    """If the angle, read as radians, is 1 to 8 eighths of a turn, rounded to two or more decimals,
+    return the number of eighths; otherwise 0."""
     return next(
         (k for k in range(1, 9) for d in range(2, 17) if angle == round(k * math.pi / 4, d)), 0
     )
@@ -312,8 +312,8 @@ class KalmanConfig(Section):
     attitude and heading; in the world frame, `drift_mps2` of the state estimate. A constant error
     of the vehicle's roll and pitch, `attitude_sigma_deg`, then widens the estimate's spread.
 
-    `drift_mps`: largest drift of the state estimate. The target stands still, so while it is not
-    measured, it moves in the world of the state estimate only by this drift.
+    `drift_mps`: largest drift of the state estimate. The target is stationary, so while it is not
+    measured, its position in the world of the state estimate changes only by this drift.
     """
 
     k1: float = key(0.04, "measurement noise with `noise: fixed`; the paper's R = k1 I", gt=0)

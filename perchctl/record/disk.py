@@ -1,4 +1,4 @@
-"""Files that contain only complete records, and a thread for writing to a disk that may hang."""
+"""Files that contain only complete records, and a thread for writing to a disk that may stall."""
 
 from __future__ import annotations
 
@@ -85,8 +85,8 @@ class BackgroundWriter:
     """
 
     def __init__(self, most: int, name: str, live: bool) -> None:
-        """Start with a queue for jobs with a total weight of up to `most`. `name` is the name of
-        the thread."""
+        """Start with a queue for jobs whose weights (see `put`) add up to at most `most`. `name` is
+        the name of the thread."""
         self.refused_jobs = 0
         self._most = most
         self._jobs: SimpleQueue[tuple[Job, int] | None] = SimpleQueue()

@@ -31,8 +31,8 @@ SCHEMA_VERSION = 5
 READABLE_VERSIONS = (1, 2, 3, 4, SCHEMA_VERSION)
 """Version 1 had no `tracked`, and no events with several fields; its missing values read as None.
 Version 2 had no turns. Version 3 did not contain the reason for a turn's decision, nor the commands
-sent in the loop's place. Up to version 4, the velocity variance was stored under the position's
-name, and the position variance was not recorded."""
+sent in the loop's place. Up to version 4, the velocity variance was stored under the name of
+the position variance, and the position variance was not recorded."""
 
 _POSE_SOURCES = {"l": "large", "s": "small", "j": "joint"}
 

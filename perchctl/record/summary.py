@@ -54,7 +54,7 @@ class FlightSummary:
             that ends without its summary.
         cause: the reason for the outcome, such as ``target not found``.
         miss_m: true distance from gear to target centre; None if unknown.
-        contact: estimated position error of the contact; None unless the vehicle hangs.
+        contact: estimated position error of the contact; None unless the vehicle is hanging.
         touchdown: how the vehicle met the floor, as far as telemetry shows it.
         hover: duration and position errors of a hover; None in a mission that perches.
         lost_records, log_problem: number of lost log records, and why they were lost; 0 and None if

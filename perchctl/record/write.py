@@ -307,7 +307,7 @@ class LogWatcher:
 
     def _end(self, summary: Mapping[str, Any] | None) -> None:
         if summary is not None:
-            # If the wait timed out earlier, the record has been written by now.
+            # Even if waiting for the disk timed out, all earlier records have been written by now.
             problem = None if self.problem == NO_ANSWER else self.problem
             lost_records = self._writer.refused_jobs + self._failed + self._unmade
             lost = {"lost_records": lost_records, "problem": problem or self.unencodable}

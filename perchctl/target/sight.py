@@ -1,6 +1,7 @@
 """Compute which part of the ceiling a camera sees, from the ground and when the gear is close.
 
-The vehicle stands or flies level. Directions are the vehicle's: forward and left.
+The vehicle is assumed to be level, on the ground as well as in flight. Directions are the
+vehicle's: forward and left.
 """
 
 from __future__ import annotations
@@ -133,8 +134,8 @@ def overhead_reach_m(
     side_m: float, camera: CameraModel, mount: Mounting, height_m: float
 ) -> float | None:
     """Return the largest distance from the camera's axis at which a marker with the side `side_m`,
-    `height_m` above the camera, is wholly in the image in any rotation; None if it is not even on
-    the axis, or if the camera does not look up."""
+    `height_m` above the camera, is wholly in the image in any rotation; None if it is not wholly
+    in the image even on the axis, or if the camera does not look up."""
     R = mount.T_body_cam[:3, :3]
     view, field = R[:, 2], FieldOfView(camera)
     if view[2] < LEAST_UP:
@@ -163,7 +164,7 @@ class TargetView:
         height_m: height above the camera.
         aside_m: offset from the camera's axis, forward and left; NaN unless the axis points up.
         reach_m: largest distance from the axis at which the large marker is wholly in the
-            image in any rotation; None if not even on the axis.
+            image in any rotation; None if it is not wholly in the image even on the axis.
     """
 
     has_marker: bool

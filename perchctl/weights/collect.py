@@ -192,7 +192,7 @@ class SessionFile:
 
 
 ActualPose = tuple[Array, VehicleState | None]
-"""The actual pose (4,), and the vehicle's attitude; None if the vehicle stands level."""
+"""The actual pose (4,), and the vehicle's attitude; None if the vehicle is level."""
 
 
 class TypedPoses:

@@ -1,10 +1,10 @@
-"""Fit the weights to the data for each axis, by the paper's LMS (least mean squares) and by the
-closed-form least squares to which it converges, and test whether they help.
+"""Fit the merge weights to the data for each axis, by the paper's LMS (least mean squares) and by
+the closed-form least squares to which it converges, and test whether they help.
 
 With a = large - actual and b = small - actual, the merged error of equation 8 is ``w a + (1 - w)
-b``. The constant part of a and b is the markers' bias. No weight can correct it, so it is reported
-separately, and the weights are fitted to the rest. Differences of yaw are wrapped about their mean
-direction.
+b``. The constant part of a and b is the markers' bias. No merge weight can correct it, so it is
+reported separately, and the weights are fitted to the rest. Differences of yaw are wrapped about
+their mean direction.
 
 Frames at one position have errors in common, so the weights are tested by cross-validation over
 whole positions. The test errors include the bias, as in a flight. Intervals are 95 % intervals by
@@ -179,7 +179,7 @@ def _run(start: float, shrink: Array, shift: Array) -> Array:
 
 
 def _recursion(errors: MarkerErrors) -> tuple[Array, Array]:
-    """Return p, scaled to the mean 1, and q, (n, 4) each, for ``w <- w - mu (p w + q)``; the rows
+    """Return p, scaled to a mean of 1, and q, (n, 4) each, for ``w <- w - mu (p w + q)``; the rows
     of outliers are zero."""
     use = errors.is_inlier
     n = np.maximum(use.sum(axis=0), 1)

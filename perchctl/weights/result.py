@@ -51,7 +51,8 @@ class FitResult:
 
     @property
     def is_proven_better(self) -> list[bool]:
-        """True for each axis on which the weight of `method` beats the better single marker."""
+        """True for each axis on which the merge weight fitted by `method` beats the better single
+        marker."""
         return [bool(p) for p in self.evidence.is_proven_better(self.method)]
 
     @property

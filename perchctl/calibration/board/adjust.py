@@ -171,7 +171,7 @@ def reject_outliers(
     """Return the fit without outliers, the views used, and the rejected views and corners.
 
     Raises:
-        InvalidValue: too many views do not fit one camera. NoSolution.
+        InvalidValue: too many views do not fit a common camera model. NoSolution.
     """
     kept, rejections = list(views), []
     whole = {view.name: view for view in views}

@@ -169,7 +169,7 @@ def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
     if isinstance(found, str):
         return found
     ids, corners, legacy = found
-    # cv2.resize keeps the outer rims of the outer pixels, half a pixel before (0, 0).
+    # cv2.resize aligns the images' outer edges, half a pixel outside the centre of pixel (0, 0).
     corners = (corners + 0.5) / scale - 0.5
     # Distance of a ChArUco board's markers from the edge of their white squares.
     white = 1.0 if board.marker_m is None else 0.5 * (1.0 - board.marker_m / board.square_m)

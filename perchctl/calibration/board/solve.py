@@ -185,7 +185,8 @@ def calibrate_camera(found: FoundViews, board: str, model: str = "auto") -> Cali
 
     Raises:
         InvalidValue: there are too few views, all views are frontal, most of the image is empty,
-            the views do not determine the focal length, or too many views fit no camera.
+            the views do not determine the focal length, or too many views do not fit a common
+            camera model.
     """
     _check_count(found.views, found)
     models = MODEL_NAMES if model == "auto" else (model,)
@@ -217,7 +218,7 @@ def robust_fit(
     model that does not fit would reject views at the edge of the image.) Return the fit, the
     views used, and the rejected views and corners.
 
-    Raises InvalidValue if the views fit no camera.
+    Raises InvalidValue if no camera model fits the views.
     """
     best: CameraFit | None = None
     for model in models:

@@ -40,7 +40,7 @@ class PivotSolution:
 
     Attributes:
         gear_cam_m: tip of the gear in the camera frame, (3,), with covariance_m2 (3, 3).
-        pivot_point_target_m: the fixed point on which the tip stood, in the target frame, (3,).
+        pivot_point_target_m: the fixed point on which the tip rested, in the target frame, (3,).
     """
 
     gear_cam_m: Array
@@ -102,8 +102,8 @@ def _misfit_covariance(poses: PoseArrays, point_m: Array) -> Array:
 def _check_slip(poses: PoseArrays, rows: PoseResiduals) -> None:
     """Raise InvalidValue if the tip slipped from one point to another during the recording.
 
-    For each of several times throughout the recording, one point is fitted before it and another
-    point after it. The time with the smallest robust misfit is used.
+    The recording is split at each of several times, and one point is fitted to the part before the
+    split, another point to the part after it. The split with the smallest robust misfit is used.
     """
     n, alone = len(rows.misfit), _size(rows)
     explains, moved_m, at_s = 0.0, 0.0, 0.0
