@@ -140,8 +140,8 @@ MAX_DAMAGED = 100
 """Number of successive packets that cannot be decoded before the source reconnects."""
 DELAY_WINDOW_S = 10.0
 CLOCK_SLOW = 0.02
-"""Relative rate by which a camera's clock may run slow; if it is slower, its images seem to grow
-older and older."""
+"""Fraction by which a camera's clock may run slow; if it is slower than that, its images seem to
+grow older and older."""
 
 _OPTIONS = {
     "rtsp_flags": "prefer_tcp",  # over UDP, a lost packet spoils all images until a keyframe
