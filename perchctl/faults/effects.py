@@ -97,8 +97,8 @@ def external_positions(
 
 def deck_silent(rig: FaultRig, t_s: float, for_s: float, acc_z_mps2: float) -> None:
     """Stop the deck's absolute positions for `for_s`. Throughout the flight, the accelerometer
-    reads `acc_z_mps2` too high along z because the motors shake it; until the positions stop, they
-    keep the resulting error of the estimate small."""
+    has an error of `acc_z_mps2` along z because the motors shake it; the positions correct the
+    resulting error of the estimate until they stop."""
     rig.set_until(t_s + for_s, rig, "deck_silent", True, False)
 
 
