@@ -42,8 +42,8 @@ class Context:
 
     @property
     def support(self) -> Support:
-        """What supports the vehicle in this tick. To find out for how long, call `true_for_s` with
-        the condition that shows this support."""
+        """What supports the vehicle in this tick. To find out how long this support has lasted,
+        call `true_for_s` with the condition that shows it."""
         return find_support(self.belief)
 
     def true_for_s(self, condition: Condition[Any]) -> float:

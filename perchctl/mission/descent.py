@@ -1,19 +1,19 @@
-"""The one descent for all cases: the planner's LANDING, a silent loop (watchdog), and the rescue.
+"""The one descent for all cases: the planner's LANDING, a blocked loop (watchdog), and the rescue.
 
 Pure: `step_landing(state, observation, profile) -> (state, command)`.
 
 A descent, a release or a motor stop that has begun is completed even if the evidence changes. A
-vehicle that still descends uses one of four policies. `descend` chooses the policy according to
-which data is known and fresh, and whether the magnet may hold the vehicle (see the table in
-docs/mission.md):
+vehicle that is still descending follows one of four policies. `descend` chooses the policy
+according to which data is known and fresh, and whether the magnet may hold the vehicle (see the
+table in docs/mission.md):
 
 - by position setpoints, straight down;
 - level, without a position: raw thrust with feedback from the vertical speed;
-- by the firmware's own landing, near the ground or if height, telemetry or loop are doubtful;
-- peeled off the magnet by a setpoint below; if the magnet does not let go, the weight is
-  transferred to it.
+- by the firmware's own landing, near the ground or if height, telemetry or loop are unreliable;
+- peeled off the magnet by a setpoint below the vehicle; if the magnet does not let go, the weight
+  is transferred to it.
 
-Only the catch of a fall commands a climb. The firmware's own landing follows a trajectory on its
+A climb is commanded only to catch a fall. The firmware's own landing follows a trajectory on its
 own clock and then stops the motors, wherever the vehicle is by then. That landing is therefore
 commanded only if a position shows the vehicle away from the ceiling.
 """
@@ -83,14 +83,15 @@ PEEL_OFF_MAGNET_TIMEOUT_S = 4.0
 weight to the magnet, s. Larger: the vehicle pulls for longer, and falls if the magnet lets go
 late."""
 MAX_CLIMB_RATE_WHEN_FALLING_OFF_MAGNET_MPS = -0.35
-"""Climb rate below which a vehicle that peels off the magnet is falling, m/s."""
+"""Climb rate below which a vehicle that is peeling off the magnet is falling, m/s."""
 MAX_HEIGHT_TO_COUNT_AS_LANDED_M = 0.05
-"""Height below which a motionless vehicle in a descent by raw thrust stands on the floor, m."""
+"""Height below which a motionless vehicle in a descent by raw thrust counts as being on the floor,
+m."""
 MAX_VERTICAL_SPEED_OF_MOTIONLESS_VEHICLE_MPS = 0.1
 """Largest vertical speed of a motionless vehicle, m/s. Larger: the motors stop while the vehicle
 still climbs or sinks."""
 ON_FLOOR_DWELL_S = 0.5
-"""Time for which a vehicle must stand still before its motors are stopped, s."""
+"""Time for which a vehicle must be motionless before its motors are stopped, s."""
 
 # --- by the firmware's own landing ---
 LANDING_COMMAND_PERIOD_S = 0.3
@@ -113,7 +114,8 @@ MAX_SPECIFIC_FORCE_IN_FALL_G = 0.5
 MAX_SINK_RATE_OF_DROP_ONTO_FLOOR_MPS = 1.0
 """Largest speed of a drop from 5 cm above the floor, m/s."""
 MIN_MIDAIR_MOTOR_CUT_HEIGHT_M = 0.4
-"""Height above which stopped motors mean a cut in the air and not a landing, m."""
+"""Height above which stopped motors mean that they were cut in flight and not that the vehicle has
+landed, m."""
 
 
 def step_landing(
@@ -162,8 +164,8 @@ def enter_descent(state: PlannerState, previous_state: PlannerState) -> PlannerS
     transition.
 
     The setpoint moves to the position of a vehicle that hovers in place, and the hover thrust is
-    estimated for the descent. A landing that the firmware already executes counts as commanded, and
-    motors that are already off count as stopped, so that no command starts them again. After a
+    estimated for the descent. A landing that the firmware is already executing counts as commanded,
+    and motors that are already off count as stopped, so that no command starts them again. After a
     press, the vehicle counts as within the magnet's reach. With only accelerometer and attitude
     left, the belief switches to dead reckoning.
     """
@@ -241,14 +243,14 @@ def act_in_landing(c: Context) -> Action:
 def descend(c: Context) -> Action:
     """Descend by one of four policies.
 
-    - Level, by raw thrust: without a position. With the target as the positioning system, also
-      below `landing.handover_m`, because the firmware's own landing would follow the camera's
-      estimate to a floor of unknown height.
+    - Level, by raw thrust: without a position. With the target as the positioning system, this
+      policy also applies below `landing.handover_m`, because the firmware's own landing would
+      follow the camera's estimate to a floor of unknown height.
     - Peel off: within the magnet's reach, lower the setpoint until the vehicle comes off. If the
       vehicle does not come off, transfer its weight to the magnet.
     - By setpoints: with a position, down to `landing.handover_m`.
-    - The firmware's own landing: below that height, or at once if height, telemetry or loop are
-      unreliable.
+    - The firmware's own landing: below `landing.handover_m`, or at once if height, telemetry or
+      loop are unreliable.
     """
     b = c.belief
     if not b.can_descend_under_position_control:
@@ -297,7 +299,7 @@ def has_descent_command_reached_minimum(c: Context) -> bool:
     )
 
 
-# --- Falls, and proof of standing ---
+# --- Falls, and proof that the vehicle is on the floor ---
 
 
 def _is_falling_free(c: Context) -> bool:
@@ -317,7 +319,7 @@ def _is_falling_free(c: Context) -> bool:
 
 
 def _is_standing_on_floor(c: Context) -> bool:
-    """True if the vehicle is proven to stand on the floor: `ON_FLOOR` has been true for
+    """True if the vehicle is proven to be on the floor: `ON_FLOOR` has been true for
     `ON_FLOOR_DWELL_S`; or, in a descent by raw thrust with valid positions from the target, the
     vehicle is lower than `MAX_HEIGHT_TO_COUNT_AS_LANDED_M`, slower than
     `MAX_VERTICAL_SPEED_OF_MOTIONLESS_VEHICLE_MPS`, and cannot be on the magnet."""
@@ -337,8 +339,8 @@ def _is_standing_on_floor(c: Context) -> bool:
 
 
 def _restart_landing_by_catching_fall(c: Context) -> Action:
-    """Restart the landing at the present height, and first stop the fall by a setpoint above the
-    vehicle (a catch)."""
+    """Restart the landing at the present height, beginning with a setpoint above the vehicle that
+    stops the fall (a catch)."""
     tel, b = c.telemetry, c.belief
     belief = replace(
         b,
@@ -366,7 +368,7 @@ def _restart_landing_by_catching_fall(c: Context) -> Action:
 
 
 def _catch_fall(c: Context) -> Action | None:
-    """Catch the fall by position; None without a heading or with diverged positions."""
+    """Catch the fall under position control; None without a heading or with diverged positions."""
     return (
         None
         if c.belief.is_heading_lost or c.belief.is_position_diverged
@@ -437,8 +439,8 @@ def make_onboard_landing_command(
 
 
 def _command_onboard_landing(c: Context) -> Action:
-    """Send the command for the firmware's own landing until the telemetry shows that the vehicle
-    executes it."""
+    """Send the command for the firmware's own landing until the telemetry shows that the vehicle is
+    executing it."""
     tel, b = c.telemetry, c.belief
     state, away = end_press(c)
     if (

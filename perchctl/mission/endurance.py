@@ -29,14 +29,14 @@ EXPECTED_STANDOFF_SETTLING_DURATION_S = 3.0
 EXPECTED_TOUCH_DURATION_S = 1.0
 """Time that the touch takes, s, as measured in simulated flights."""
 EXPECTED_LANDING_DURATION_BEYOND_DESCENT_S = 3.0
-"""Time that the end of a landing takes beyond the descent, s, as measured in simulated flights."""
+"""Time that a landing takes in addition to its descent, s, as measured in simulated flights."""
 MAX_VOLTAGE_DIP_BELOW_LIMIT_IN_PRESS_V = 0.3
 """Largest voltage dip below `safety.min_load_v`, V, during a press that is shorter than the
 debounce time."""
 COUNTED_ON_HOVER_TIME_FRACTION = 0.7
-"""Fraction of a predicted hover time that an attempt counts on: for worn cells near the end of
-their charge, the prediction is up to a third too long (tests/mission/test_energy.py). Larger: an
-attempt may be lost in its ascent, or its landing may end in a fall."""
+"""Fraction of a predicted hover time on which an attempt may rely: for worn cells near the end of
+their charge, the prediction is up to a third too long (tests/mission/test_energy.py). Larger: a
+battery that runs low may end an attempt in its ascent, or its landing may end in a fall."""
 EXPECTED_BACK_OFF_DURATION_S = 3.0
 """Time after an attempt until the vehicle is steady and sees the target again, s."""
 
@@ -118,10 +118,11 @@ def predict_hover_times(
 ) -> HoverTimes | None:
     """Return the hover times at `hover_thrust_fraction` (fraction of full thrust); None if unknown.
 
-    The row `battery-low` applies at the earlier of two events. The firmware reports low power
-    `FIRMWARE_LOW_POWER_REPORT_DELAY_S` after the voltage in hover has fallen to its limit; or the
-    voltage falls below `safety.min_load_v`, in hover or during a press. A press that is shorter
-    than the debounce time may dip below that voltage by `MAX_VOLTAGE_DIP_BELOW_LIMIT_IN_PRESS_V`.
+    The row `battery-low` applies at the earlier of two events: either the firmware reports low
+    power, `FIRMWARE_LOW_POWER_REPORT_DELAY_S` after the voltage in hover has fallen to the
+    firmware's limit; or the voltage falls below `safety.min_load_v`, in hover or during a press.
+    During a press that is shorter than the debounce time, the voltage may be lower than
+    `safety.min_load_v` by `MAX_VOLTAGE_DIP_BELOW_LIMIT_IN_PRESS_V`.
     """
     if (
         battery_fit.rest_v is None
@@ -170,7 +171,7 @@ class MissionDurations:
 def predict_durations(c: Context) -> MissionDurations:
     """Predict the times, s, that the rest of this attempt, each retry and the landing take, from
     the height of the known target, the speeds in the profile, and typical times of the stages
-    without a set speed. A hover counts with its whole duration. The target's position must be
+    without a set speed. The whole duration of a hover is counted. The target's position must be
     known."""
     planner, hover = c.planner, c.planner.hover
     top_z_m = c.belief.target.vehicle_world_z_when_touching_m - (

@@ -65,8 +65,8 @@ longer."""
 CAMERA_GUIDED_RAMP_DOWN_HOVER_FRACTION_PER_S = 0.1
 """Rate at which the thrust of a vehicle that does not sink is reduced in a descent by pictures, as
 a fraction of the hover thrust per second; pictures show only after a quarter of a second that the
-vehicle sinks. Larger: the vehicle falls at first. Smaller: the vehicle stands on the floor for
-longer with its motors running."""
+vehicle sinks. Larger: the vehicle falls at first. Smaller: the vehicle is on the floor for longer
+with its motors running."""
 MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS = 0.05
 """Sink rate, from the telemetry and the commands since its newest sample, below which the vehicle
 counts as not sinking, m/s."""
@@ -129,9 +129,9 @@ MIN_SEEN_GEAR_BELOW_TARGET_IF_DETACHED_M = 0.2
 has let go, m. Larger: the vehicle drifts for longer before it brakes. Smaller: a target seen at an
 angle seems to be above."""
 MAX_THRUST_TO_HOVER_RATIO_IF_SEEN_STANDING = 0.75
-"""Fraction of the hover thrust below which a vehicle that does not move in the pictures must be
-standing on the floor: in the air, it would sink at 1 m/s. Larger: a slow start of the descent looks
-like the floor. Smaller: the motors run on the floor for longer."""
+"""Fraction of the hover thrust below which a vehicle that does not move in the pictures must be on
+the floor: in the air, it would sink at 1 m/s. Larger: a slow start of the descent looks like the
+floor. Smaller: the motors run on the floor for longer."""
 MAX_THRUST_RAMP_INTEGRATION_STEP_S = 0.1
 """Longest time between two ticks that the ramp integrates, s."""
 
@@ -177,7 +177,8 @@ def _climb_rate_measurement_age_s(c: Context) -> float:
 
 def should_wait_for_climb_rate(c: Context) -> bool:
     """True if neither climb rate nor hover thrust is known well enough for a descent by raw thrust;
-    in that case, setpoints are better, for at most `MAX_DURATION_OF_DESCENT_BY_SETPOINTS_S`."""
+    in that case, the vehicle descends by setpoints, for at most
+    `MAX_DURATION_OF_DESCENT_BY_SETPOINTS_S`."""
     begins_rough = (
         c.state.descent.last_commanded_raw_thrust == 0.0
         and c.belief.hover_thrust_estimate.is_imprecise
@@ -204,7 +205,8 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
         climb_mps <= -MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS,
         THRUST_RAMP_DOWN_RATE_HOVER_FRACTION_PER_S,
     )
-    # Pictures must show the sinking: a vehicle on the floor does not respond to commands.
+    # With pictures, only the measured speed can show that the vehicle is sinking, not the predicted
+    # effect of commands: a vehicle on the floor does not respond to commands.
     if _visual_motion_if_telemetry_old(c) is not None:
         is_sinking, ramp_per_s = (
             measured_mps <= -MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS,

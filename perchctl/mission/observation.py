@@ -49,19 +49,19 @@ class Observation:
     tick_start_delay_s: float = 0.0  #: delay of the start of this tick
     successive_marker_conflicts: int = 0  #: number of successive frames with contradicting markers
     operator_request: OperatorRequest = OperatorRequest.NONE
-    #: why the fleet's parent does not permit the climb; None if it does, or without a fleet
+    #: why the fleet's parent process does not permit the climb; None if it does, or without a fleet
     climb_withheld_reason: str | None = None
     flight_log_problem: str | None = None  #: the flight log cannot be written
     #: latency beyond the profile's, subtracted from the frames' times (`measured`)
     camera_latency_above_profile_s: float = 0.0
     #: standard deviation of the latency (`measured`); 0 if it is configured
     camera_latency_sigma_s: float = 0.0
-    #: why the last target in view belongs to another vehicle
+    #: why the last target in view was rejected as another vehicle's target
     target_refusal_reason: str | None = None
     external_position_age_s: float = 0.0  #: age of the newest external position sent; 0 with decks
     #: why no external position is sent; None while positions are sent
     external_position_problem: str | None = None
-    #: distance from the estimate to the newest sighting; 0 if it was accepted
+    #: distance from the estimate to the newest sighting; 0 if the sighting was accepted
     rejected_sighting_to_estimate_distance_m: float = 0.0
     imu: ImuMotion = field(default_factory=ImuMotion)  #: motion from all samples up to `telemetry`
     #: newest motion on which pictures and accelerometer agreed

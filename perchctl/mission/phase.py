@@ -133,15 +133,15 @@ class VehicleDiagnosis(Flag):
     BLOCKED_BY_OBSTACLE = auto()
     """An obstacle is just above the vehicle."""
     SLIPPED_OFF_CONTACT = auto()
-    """The vehicle falls off its contact."""
+    """The vehicle is falling off its contact."""
     STILL_AT_PROVEN_CONTACT = auto()
     """The contact was proven, and the vehicle has not come off."""
     HANGING_AT_LAST_TOUCH = auto()
-    """The vehicle hangs where it last touched the target."""
+    """The vehicle is hanging where it last touched the target."""
     HELD_BY_OTHER_OBJECT = auto()
-    """Something other than the target holds the vehicle."""
+    """Something other than the target is holding the vehicle."""
     EXTERNAL_POSITIONS_WRONG = auto()
-    """External positions lead position control away from its setpoint."""
+    """The external positions are leading the vehicle away from its setpoint."""
     CAMERA_MOUNTING_WRONG = auto()
     """The camera's mounting differs from the profile, or the axes of the positions are wrong."""
     PROFILE_MAY_BE_WRONG = auto()

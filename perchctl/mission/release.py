@@ -1,8 +1,9 @@
 """Actions at the ceiling: end of a press, release onto the magnet, motor stop, and catch.
 
-In position mode, the onboard controller never goes below `MIN_FIRMWARE_POSITION_MODE_THRUST`. Raw
-thrust can be reduced until the motors stop turning (docs/firmware.md, "Release in raw mode"): the
-whole weight is transferred to the magnet and monitored before the motors are stopped.
+In position mode, the onboard controller never commands less than
+`MIN_FIRMWARE_POSITION_MODE_THRUST`. Raw thrust can be reduced until the motors stop turning
+(docs/firmware.md, "Release in raw mode"): the whole weight is transferred to the magnet and
+monitored before the motors are stopped.
 """
 
 from __future__ import annotations
@@ -131,8 +132,8 @@ def reduce_press_before_weight_transfer(c: Context) -> Action:
 
 
 def transfer_weight_by_raw_thrust(c: Context, *, max_telemetry_age_s: float = 0.0) -> Action:
-    """Perform the second stage of the release: reduce raw thrust until the motors stand still, and
-    stop them once the whole weight has hung for long enough.
+    """Perform the second stage of the release: reduce raw thrust until the motors stop turning, and
+    command the motor stop once the support has carried the whole weight for long enough.
 
     The stage restarts while the telemetry is older than `max_telemetry_age_s` and too old to count
     as evidence.
@@ -189,7 +190,7 @@ def has_thrust_ramped_down(c: Context) -> bool:
 def stop_motors(c: Context) -> Action:
     """Send the stop command, and with it the message that ends high-level setpoints (notify),
     `STOP_COMMAND_COUNT` times: if a single notify were lost, the firmware's supervisor would lock
-    the hanging vehicle. Send more while the telemetry shows thrust."""
+    the hanging vehicle. Send more stop commands while the telemetry shows thrust."""
     state, now_s = c.state, c.t_s
     if state.motor_stop_commanded_at_s is None:
         return replace(
@@ -220,9 +221,8 @@ def stop_motors(c: Context) -> Action:
 def choose_catch_setpoint_height_above_vehicle_m(
     hover_thrust: float, reported_thrust: float
 ) -> float:
-    """Return the height, m, of the setpoint above a falling vehicle that catches the fall. The
-    height depends on whether the motors turn, which the reported and the hover thrust (0..65535)
-    show."""
+    """Return how far above a falling vehicle, m, a setpoint must be to catch the fall. The height
+    depends on whether the motors turn, which the reported and the hover thrust (0..65535) show."""
     turning = reported_thrust > MIN_THRUST_TO_HOVER_RATIO_IF_MOTORS_ON * hover_thrust
     return (
         CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_ON_M
@@ -258,10 +258,10 @@ def catch_falling_vehicle(c: Context) -> Action | None:
 
 
 def _braking_setpoint_world_xy_m(c: Context) -> tuple[float, float]:
-    """Return world x and y, m, of a setpoint that brakes the lateral velocity by which dead
-    reckoning exceeds the state estimate, which has not measured it. The setpoint is behind the
-    vehicle, opposite to this velocity, by the velocity (at most `MAX_BRAKED_LATERAL_SPEED_MPS` per
-    axis) divided by `ONBOARD_POSITION_GAIN_PER_S`."""
+    """Return world x and y, m, of a setpoint that brakes the lateral velocity that dead reckoning
+    shows and the state estimate does not (the difference between the two). The setpoint is behind
+    the vehicle, opposite to this velocity, by the velocity (at most `MAX_BRAKED_LATERAL_SPEED_MPS`
+    per axis) divided by `ONBOARD_POSITION_GAIN_PER_S`."""
     tel, reckoned_mps = c.telemetry, c.belief.dead_reckoning.velocity_mps
     missing_mps = (reckoned_mps[i] - tel.velocity_mps[i] for i in range(2))
     x_mps, y_mps = (

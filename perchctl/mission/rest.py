@@ -12,16 +12,17 @@ from perchctl.mission.context import Context
 from perchctl.mission.phase import Phase, VehicleDiagnosis
 
 MAX_HEIGHT_DRIFT_BELOW_CONTACT_IF_HANGING_M = 0.3
-"""Distance below its contact at which a vehicle still hangs, m; allows for drift of the
-estimate."""
+"""Largest distance below its contact at which a vehicle counts as still hanging, m; allows for
+drift of the estimate."""
 MIN_HEIGHT_TO_INFER_HANGING_M = 0.45
 """Height above which hanging can be distinguished from standing on the floor, m; it is compared
 with the height at the start of a descent or with the present height."""
 MAX_HEIGHT_RESTING_ON_FLOOR_M = 0.3
-"""Height up to which a vehicle with its motors off stands on the floor, m."""
+"""Height up to which a vehicle with its motors off counts as being on the floor, m."""
 MAX_HEIGHT_LOSS_IF_STILL_HANGING_M = 0.15
-"""Height loss below which a vehicle still hangs where the descent began, m. Larger: a vehicle on a
-table seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to have come off."""
+"""Height loss below which a vehicle counts as still hanging where the descent began, m. Larger: a
+vehicle on a table seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to have
+come off."""
 
 
 class RestState(Enum):
@@ -109,7 +110,7 @@ def _find_rest_state_from_falls(c: Context) -> RestState:
 
 
 def is_still_hanging(c: Context) -> bool:
-    """True if the vehicle still hangs.
+    """True if the vehicle is still hanging.
 
     With a recorded contact and a valid position from a deck or motion capture, the vehicle hangs if
     it does not sink faster than `complete.slip_mps` and is at most
@@ -134,7 +135,7 @@ def is_still_hanging(c: Context) -> bool:
 
 
 def is_hanging_with_motors_off(c: Context) -> bool:
-    """True if the motors were stopped while the vehicle hung, and it still hangs."""
+    """True if the motors were stopped while the vehicle was hanging, and it is still hanging."""
     motor_stop_commanded_at_s, landing = (
         c.state.motor_stop_commanded_at_s,
         c.state.phase is Phase.LANDING,

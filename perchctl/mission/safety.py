@@ -287,8 +287,8 @@ def wrong_camera_mounting_reason(c: Context) -> str:
 
 def is_held_by_target(c: Context) -> bool:
     """True if thrust, position and motion have shown for `HANGING_CONFIRMATION_DWELL_S` that
-    something holds the vehicle, and this is the target's magnet, although no press has proven a
-    contact."""
+    something is holding the vehicle, and if this support is the target's magnet, although no press
+    has proven a contact."""
     hangs = c.true_for_s(HANGING) >= HANGING_CONFIRMATION_DWELL_S
     return hangs and c.support is Support.MAGNET
 

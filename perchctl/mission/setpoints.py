@@ -14,7 +14,8 @@ on the whole chain from setpoint to position: a setpoint acts through the attitu
 tilt becomes velocity a tenth of a second later. Feedback of the tilt permits higher gains without
 oscillation, but only while the telemetry is prompt. Therefore, `gain` is the smaller of two
 factors: one grows from 0 to 1 as the target comes closer, and one falls from 1 to 0 as the
-telemetry ages. At 0, the vehicle is left to its onboard controllers, which act without that delay.
+telemetry ages. With a `gain` of 0, the vehicle is left to its onboard controllers, which act
+without the delay of the telemetry.
 """
 
 from __future__ import annotations
@@ -139,8 +140,8 @@ def step_setpoint_towards(
 
 
 def fly_to(c: Context, reference: PositionSetpoint, *, corrects_height: bool = True) -> Action:
-    """Store the setpoint `reference`, where the vehicle should be, and send the one that brings it
-    there in spite of wind and onboard control errors (`correct_setpoint`). Without
+    """Store the setpoint `reference`, where the vehicle should be, and send a setpoint that brings
+    it there in spite of wind and onboard control errors (`correct_setpoint`). Without
     `corrects_height`, the height sent is that of `reference`."""
     return replace(c.state, setpoint=reference), limit_setpoint(
         c, correct_setpoint(c, reference, corrects_height=corrects_height)

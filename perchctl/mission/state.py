@@ -148,8 +148,8 @@ class PlannerState:
 
     @property
     def pause_reason(self) -> str:
-        """Why the mission pauses: the reason for the hold, or for waiting in the phase, which a row
-        of the transition table gives. Empty if it does not pause."""
+        """Why the mission is paused: the reason for the hold, or the reason that a row of the
+        transition table gives for waiting in the phase. Empty if the mission is not paused."""
         return self.hold_reason or self.waiting_reason
 
     @property

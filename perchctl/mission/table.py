@@ -89,8 +89,8 @@ TRANSITIONS_ALLOWED_FOR_OWN_ROWS = frozenset(
     if row.severity >= Severity.HOLD and not row.to.is_final
 ) | {(Phase.ALIGN, Phase.ALIGN, Severity.HOLD)}
 """Combinations of phase, next phase and severity allowed for your own rows: wait in ALIGN, or
-interrupt the mission as the built-in table does. None of these transitions climbs, stops a motor,
-or proves a contact."""
+interrupt the mission as the built-in table does. None of these transitions makes the vehicle climb,
+stops a motor, or proves a contact."""
 
 
 def add_rows(
@@ -180,7 +180,7 @@ def load_table(extension_name: str | None) -> tuple[Transition, ...]:
         return TABLE
     own = load_extension(extension_name, "planner.rows")
     try:
-        # The profile in a log may name any object.
+        # The profile in a log may name any object, so only a function is called.
         own = own() if isfunction(own) else own
     except Exception as error:
         raise InvalidValue(f"planner.rows: {extension_name} raised {error_at(error)}") from error

@@ -62,7 +62,7 @@ def add_samples(
     `jumped` and `turned_rad` describe the new samples; if `late` is True, they also cover the
     earlier samples of the same tick. A sample without position or velocity gets both from the
     previous sample. Other samples with NaN, and samples that are out of order, are dropped (fault
-    35).
+    35 in docs/faults.md).
     """
     jumped, turned_rad = (history.jumped, history.turned_rad) if late else (False, 0.0)
     samples, imu = list(history.samples), history.imu

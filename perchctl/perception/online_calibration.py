@@ -23,8 +23,8 @@ from perchctl.vision import CameraCalibrationErrors, MarkerPose, PoseSetup, Vehi
 SOLVE_EVERY_S = 1.0
 """Time between solutions of the sums, s."""
 LIKELY_S = 0.02
-"""Once the standard deviation of the delay is below this value, s, the factors of the next images
-are computed with the estimated delay."""
+"""Once the standard deviation of the delay is below this value, s, the measurement rows of the next
+images are computed with the estimated delay."""
 USED_SIGMA_S = 0.008
 """Largest standard deviation of a delay that is applied, s: an error of 30 ms makes an alignment
 oscillate."""
@@ -36,8 +36,8 @@ FAST_SLEW = 0.5
 different latency. This rate is below 1 because the images' times would otherwise run backwards.
 Smaller: a vehicle with late positions oscillates for longer."""
 CHANGED_S = 0.05
-"""If a correction differs from a certain estimate by more than this value, s, the latency has
-changed in flight."""
+"""If a correction differs by more than this value, s, from an estimate that was already certain,
+the latency has changed in flight."""
 UNKNOWN_SIGMA_S = (USED_LATENCY_S[1] - USED_LATENCY_S[0]) / math.sqrt(12.0)
 """Standard deviation of a latency that may be anywhere within `USED_LATENCY_S`, s."""
 LONGEST_STEP_S = 0.1
@@ -177,8 +177,8 @@ MOST_GAP_S = 0.5
 GATE_SIGMAS = 5.0
 """Number of standard deviations beyond which a change of the target's position counts as a jump."""
 _POSSIBLE = np.array([0.0, 0.2, 0.4, 0.4, 0.4, 0.0, 0.0, 0.0])
-"""Delay (0.2 s) and mounting rotations (0.4 rad) up to which they may explain a change of the
-target's position that exceeds the noise; a larger change counts as a jump."""
+"""Largest delay (0.2 s) and mounting rotations (0.4 rad) that may explain a change of the target's
+position that exceeds the noise; a larger change counts as a jump."""
 LEAST_RANGE_M = 0.15
 """Minimum range of the target, m; at closer range, the line of sight hardly moves and the press
 follows soon."""

@@ -1,10 +1,10 @@
 """Check that the images show the motion that the accelerometer measures.
 
 Take the vector from the body to the target, rotated by the attitude at the exposure, and add the
-body's own motion from the accelerometer. This sum is a fixed position, except for the unknown speed
-at the start of the window and a constant offset of the accelerometer. If the images are later than
-assumed, or if the camera is rotated about the upward axis, the sum moves; with the correct delay or
-rotation (a hypothesis), it is at rest.
+body's own motion from the accelerometer. This sum of the two vectors is a fixed position, except
+for the effects of the unknown speed at the start of the window and of a constant offset of the
+accelerometer. If the images are later than assumed, or if the camera is rotated about the upward
+axis, the sum moves; with the correct delay or rotation (a hypothesis), it is at rest.
 """
 
 from __future__ import annotations
@@ -59,10 +59,11 @@ MEASURED_LATER_S = 0.03
 accurate, slower estimate in `perchctl.perception.online_calibration`. Larger: an alignment
 oscillates for longer. Smaller: the step of the grid and the jitter of an image's time count as an
 error."""
-# For a mismatch, the sum must move by at least this distance, m, and by at least this multiple of
-# its motion under the best hypothesis.
+# For a mismatch, the target's apparent motion must be at least this large, m, and at least this
+# multiple of the apparent motion under the best hypothesis.
 WANDERS_M, WANDERS_MORE = 0.005, 3.0
-ROUGH_M = 0.03  # a sum that moves by this much within a second yields the speed to 0.05 m/s
+# if the target appears to move by this distance, m, within a second, the speed is known to 0.05 m/s
+ROUGH_M = 0.03
 ALIKE_S = 3 * STEP_S
 """Two delays agree if they differ by at most this, s."""
 
@@ -136,7 +137,7 @@ class VisualInertialWindow:
     agree_count: int = 0  # Number of successive checks that agree.
     is_corrected: bool = False  # True if `latest` is an error of a measured latency.
     in_use_s: float = 0.0  # `mismatch` is relative to this delay.
-    # newest motion for which the sum moved by at most `motion_within_m`
+    # newest motion with which the target appears to move by at most `motion_within_m`
     motion: VisualInertialMotion | None = None
     motion_within_m: float = WANDERS_M
     felt: FeltSamples = field(default_factory=FeltSamples, compare=False, repr=False)
@@ -325,8 +326,8 @@ def fit_hypotheses(
     x, y = _turned(x, y, yaw)
     x, y, z = (a + np.interp(then_s, stamps_s, b) for a, b in zip((x, y, z), moved.T, strict=True))
 
-    # Residual motion of the sum after fitting a position, a velocity and an offset of the
-    # acceleration.
+    # The target's apparent motion is what remains after fitting a position, a velocity and an
+    # offset of the acceleration.
     u = seen_s - seen_s.mean()
     unknown = np.stack([np.ones_like(u), u, 0.5 * u * u], axis=1)
     known = np.diag([0.0, 0.0, (SIGMA_M / OFFSET_MPS2) ** 2])

@@ -1,8 +1,8 @@
 """The vision pipeline, which runs each frame through detection, pose, filter and merge.
 
-`step` is the only path from an image to a pose, and `estimate` predicts its result for any later
-time. All memory is in `PipelineState`, which the functions take and return. Small matrices are
-multiplied with `dot` because `@` takes twice as long.
+`step` is the only path from an image to a pose, and `estimate` predicts the target's pose for any
+later time. All memory is in `PipelineState`, which the functions take and return. Small matrices
+are multiplied with `dot` because `@` takes twice as long.
 """
 
 from __future__ import annotations

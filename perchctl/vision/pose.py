@@ -615,7 +615,8 @@ def compute_corner_weights(
             error_shifts[rows, 1] = d.corner_shift_per_readout_sigma_px.ravel()
         if d.row_jitter_sigma_px > 0.0:
             # As with a fitted line, the errors are a common shift of the rows (half the standard
-            # deviation) and a tilt. Together they reach all of it in the outermost rows.
+            # deviation) and a tilt. Together, the two reach the whole standard deviation in the
+            # outermost rows.
             down = corners[:, 1] - corners[:, 1].mean()
             down /= max(float(np.abs(down).max()), 1e-9)
             along_x = slice(8 * i, 8 * i + 8, 2)

@@ -147,9 +147,9 @@ def update_tracks(
 # target does not jump. A pose that contradicts the lock by more than noise, motion and drift can
 # explain belongs to a rival and updates no filter.
 #
-# The lock changes to a rival that is seen with both markers. It changes at once if the locked
-# target was never seen with both markers. Otherwise, it changes if the rival and the target are
-# equally far away and the target was not seen for `REACQUIRE_S` although its position is in the
+# The lock changes to a rival that is seen with both markers. The change is immediate if the locked
+# target was never seen with both markers. Otherwise, the lock changes if the rival and the target
+# are equally far away and the target was not seen for `REACQUIRE_S` although its position is in the
 # image. If the lock has only a few frames, it changes to any rival that was seen more often.
 #
 # If the camera is not on a vehicle, neither its motion nor the number of frames that a recording
@@ -197,7 +197,8 @@ _POSITION_SELECTION_MATRIX: Array = np.diag([0.0, 1.0, 1.0, 1.0])
 _MIN_RIVAL_ROTATION_TO_REPORT_RAD = math.radians(15.0)
 # Limits of a hovering vehicle's motion relative to the target during a jump of the estimate.
 _MAX_CALM_DURATION_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
-# An explanation is accepted if it leaves less than this fraction of the other's squared innovation.
+# A jump of the state estimate, or a wrong last pose, is accepted as an explanation if it reduces
+# the squared innovation to less than this fraction.
 _MAX_COST_RATIO_TO_ALTERNATIVE = 0.25
 
 

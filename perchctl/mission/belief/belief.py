@@ -129,7 +129,7 @@ class Belief:
 
     @classmethod
     def initial_on_ground(cls, obs: Observation, profile: Profile) -> Belief:
-        """Return the belief about a vehicle that stands at its take-off position."""
+        """Return the belief about a vehicle that is on the ground at its take-off position."""
         return cls(
             obs=obs, profile=profile, t_s=obs.t_s, takeoff_position_m=obs.telemetry.position_m
         )
@@ -198,9 +198,9 @@ class Belief:
 
     @cached_property
     def max_axis_position_variance_m2(self) -> float:
-        """Variance of the estimated position along its most uncertain axis, m^2; with decks, of the
-        height alone, because a Flow deck measures no other position. Infinite if unknown, 0 if
-        `link.unreported` says that the vehicle does not report it."""
+        """Variance of the estimated position along its most uncertain axis, m^2; with decks, the
+        variance of the height alone, because a Flow deck measures no other position. Infinite if
+        unknown, 0 if `link.unreported` says that the vehicle does not report it."""
         tel = self.obs.telemetry
         by_deck = self.profile.positioning.source.is_deck
         return self._replace_missing_variance(
@@ -293,8 +293,8 @@ class Belief:
     @cached_property
     def is_flight_data_unreliable(self) -> bool:
         """True if the state estimate has jumped, the telemetry is older than
-        `safety.telemetry_hold_s`, the link reports a problem, or the loop runs late. A descent is
-        then left to the firmware's own landing where that is possible."""
+        `safety.telemetry_hold_s`, the link reports a problem, or the loop is running late. A
+        descent is then left to the firmware's own landing where that is possible."""
         safety = self.profile.safety
         return (
             self.obs.link_problem is not None
@@ -326,7 +326,7 @@ class Belief:
 
     @cached_property
     def can_descend_under_position_control(self) -> bool:
-        """True if the vehicle can descend under position control, by a position from any source
+        """True if the vehicle can descend under position control, using a position from any source
         (deck, motion capture or target): positions have not diverged, dead reckoning has not
         replaced them, and the heading is not lost (unless the telemetry is too old for the
         alternative, raw thrust). With the target as the source,
@@ -420,7 +420,7 @@ class Belief:
         return self.obs.telemetry.velocity_mps[2]
 
     def is_sinking(self, min_sink_mps: float) -> bool:
-        """True if the vehicle sinks faster than `min_sink_mps` (positive), according to
+        """True if the vehicle is sinking faster than `min_sink_mps` (positive), according to
         `climb_mps`.
 
         Without a valid position, the accelerometer must also read less than 1 g by more than

@@ -10,17 +10,17 @@ another object.
 
 One threshold decides whether the thrust exceeds hover thrust (`is_thrust_above_hover`). A vehicle
 at rest with that thrust is pressing (`is_pressing`): against the target if it is at the target's
-height (`TARGET_CONTACT`), against an obstacle if its setpoint is above it (`CLIMB_BLOCKED`), and
-against an unknown object without a position (`IMU_SHOWS_SUPPORT`). `IMU_SHOWS_SUPPORT` also applies
-if the thrust is too small; its lower threshold is as far below hover thrust as the threshold for a
-press is above it. A change of `MIN_PRESS_TO_HOVER_THRUST_RATIO` therefore affects all of these
-conditions, and `Support.AIR`. `HANGING`, `MAGNET_HOLDS_VEHICLE` and `ON_FLOOR` require a thrust too
-small to support the vehicle (`is_thrust_too_low_to_fly`).
+height (`TARGET_CONTACT`), against an obstacle if the setpoint is above the vehicle
+(`CLIMB_BLOCKED`), and, if its position is unknown, against an unknown object (`IMU_SHOWS_SUPPORT`).
+`IMU_SHOWS_SUPPORT` also applies if the thrust is too small; its lower threshold is as far below
+hover thrust as the threshold for a press is above it. A change of `MIN_PRESS_TO_HOVER_THRUST_RATIO`
+therefore affects all of these conditions, and `Support.AIR`. `HANGING`, `MAGNET_HOLDS_VEHICLE` and
+`ON_FLOOR` require a thrust too small to support the vehicle (`is_thrust_too_low_to_fly`).
 
-`find_support` combines these conditions into one result: the vehicle flies, presses, hangs on the
-magnet, hangs on something else or stands, or its support is unknown. `true_for_s` returns how long
-a condition has lasted. Each row of the transition table has its own dwell time, chosen by what a
-mistake would cost.
+`find_support` combines these conditions into one result: the vehicle is flying, pressing, hanging
+on the magnet, held by something else, or on the floor, or its support is unknown. `true_for_s`
+returns how long a condition has lasted. Each row of the transition table has its own dwell time,
+chosen by what a mistake would cost.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ far larger."""
 
 # --- motion and position ---
 MAX_MOTIONLESS_CLIMB_RATE_MPS = 0.05
-"""Vertical speed below which the vehicle counts as motionless, m/s. Larger: a slow sink looks like
-hanging."""
+"""Vertical speed below which the vehicle counts as motionless, m/s. Larger: a slow descent looks
+like hanging."""
 MAX_HOVER_SPEED_MPS = 0.3
 """Largest speed at which the thrust is hover thrust, m/s."""
 MAX_HOVER_CLIMB_RATE_MPS = 0.27
@@ -93,24 +93,24 @@ MIN_HEIGHT_LOSS_TO_ACCEPT_FLOOR_M = 0.1
 MAX_HEIGHT_LOSS_IF_HELD_AT_DESCENT_START_M = 0.1
 """Height loss within which a descending vehicle may still be held where its descent began, m."""
 MAX_ESTIMATED_HEIGHT_ON_FLOOR_AFTER_DRIFT_M = 0.3
-"""Estimated height up to which a vehicle held at low thrust may stand on the floor instead of
-hanging, m; allows for the drift of the height in flight. (`MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M`
-applies before take-off, when the height has not drifted yet.)"""
+"""Estimated height up to which a vehicle held at low thrust may be on the floor instead of hanging,
+m; allows for the drift of the height in flight. (`MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M` applies
+before take-off, when the height has not drifted yet.)"""
 MIN_HEIGHT_OF_BLOCKED_CLIMB_M = 0.15
 """Height above which a blocked vehicle has left the ground, m."""
 MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M = 0.1
-"""Height below which a vehicle may still stand on the ground instead of pressing, m."""
+"""Height below which a vehicle may still be on the ground instead of pressing, m."""
 MAX_GEAR_TO_TARGET_Z_WHEN_HANGING_M = 0.15
 """Largest height difference between gear and target, m, at which the vehicle may hang on its
 magnet."""
 MIN_GEAR_TO_TARGET_Z_WHEN_ON_FLOOR_M = 0.3
-"""Smallest height difference between gear and target, m, of a vehicle that stands on the floor."""
+"""Smallest height difference between gear and target, m, of a vehicle that is on the floor."""
 MAX_CLIMB_RATE_IF_FALLING_IN_WEIGHT_TRANSFER_MPS = -0.05
 """Climb rate below which a vehicle with a low specific force is falling, once the weight transfer
 by raw thrust has begun, m/s."""
 MIN_CLIMB_RATE_IF_TOO_WEAK_TO_CLIMB_MPS = -0.15
-"""Climb rate above which a vehicle at full thrust is too weak to climb, m/s; below it, the vehicle
-falls."""
+"""Climb rate, m/s, that distinguishes two reasons why a vehicle at full thrust does not climb:
+above this value, it is too weak to climb; below it, the vehicle is falling."""
 
 # --- time ---
 MIN_TIME_AFTER_STOP_TO_TRUST_ZERO_THRUST_S = 5.0
@@ -308,7 +308,7 @@ def is_thrust_above_hover(b: Belief) -> bool:
 def is_pressing(b: Belief) -> bool:
     """True if the thrust exceeds hover thrust (`is_thrust_above_hover`), the estimated vertical
     speed is at most `MAX_MOTIONLESS_CLIMB_RATE_MPS` in either direction, and the vehicle is too
-    high to stand on the ground."""
+    high to be on the ground."""
     return (
         is_thrust_above_hover(b)
         and abs(b.telemetry.velocity_mps[2]) <= MAX_MOTIONLESS_CLIMB_RATE_MPS
@@ -320,8 +320,8 @@ def is_pressing(b: Belief) -> bool:
 
 
 def is_slipping(b: Belief) -> bool:
-    """True if the vehicle sinks faster than `complete.slip_mps` after a contact, and either its
-    estimated height is not above that of the contact (within
+    """True if the vehicle is sinking faster than `complete.slip_mps` after a contact, and either
+    its estimated height is not above the height of the contact (within
     `MAX_HEIGHT_ESTIMATE_DRIFT_UP_DURING_SLIP_M`), or the accelerometer reads less than
     `complete.slip_acc_g`, or the position is not valid. False if no contact is recorded."""
     complete, tel = b.profile.planner.complete, b.telemetry
@@ -377,7 +377,7 @@ def _is_magnet_holding_vehicle(b: Belief) -> bool:
 
 
 def _is_hanging_with_motors_stopped(b: Belief) -> bool:
-    """True if the vehicle hangs, with its motors stopped, where it made contact: the weight
+    """True if the vehicle is hanging, with its motors stopped, where it made contact: the weight
     transfer has begun, the reported thrust is at most `MAX_RAW_THRUST_WITH_MOTORS_STOPPED` (or is
     unreliable), and the vehicle neither moves vertically nor slips."""
     return (
@@ -392,7 +392,7 @@ def _is_hanging_with_motors_stopped(b: Belief) -> bool:
 
 
 def _is_hanging(b: Belief) -> bool:
-    """True if something holds the vehicle up: it is motionless, off the floor, at a thrust too
+    """True if something is holding the vehicle up: it is motionless, off the floor, at a thrust too
     small to support it. Without a position, a magnet cannot be distinguished from the floor; the
     slow weight transfer is safe in both cases."""
     tel, complete = b.telemetry, b.profile.planner.complete
@@ -463,8 +463,8 @@ def _is_on_floor(b: Belief) -> bool:
 
 
 def _is_pressing_against_obstacle(b: Belief) -> bool:
-    """True if the vehicle presses against an obstacle: the setpoint is above it, the thrust exceeds
-    hover thrust or is at its limit, and nothing moves."""
+    """True if the vehicle is pressing against an obstacle: the setpoint is above the vehicle, the
+    thrust exceeds hover thrust or is at its limit, and the vehicle does not move."""
     setpoint, tel = b.command_history.setpoint, b.telemetry
     if (
         setpoint is None
@@ -479,8 +479,8 @@ def _is_pressing_against_obstacle(b: Belief) -> bool:
 
 
 def _does_imu_show_support(b: Belief) -> bool:
-    """True if accelerometer and thrust alone show that something supports the vehicle or that it
-    presses against something.
+    """True if accelerometer and thrust alone show that something is supporting the vehicle or that
+    it is pressing against something.
 
     The thrust is above or below hover thrust by at least the margin in
     `MIN_PRESS_TO_HOVER_THRUST_RATIO`, which would accelerate a vehicle in the air. Nevertheless,
@@ -514,16 +514,16 @@ TARGET_CONTACT = Condition(
 MAGNET_HOLDS_VEHICLE = Condition(
     "magnet holds", _is_magnet_holding_vehicle, required_data=RequiredData.TELEMETRY
 )
-"""The magnet holds the vehicle: low thrust, and no slip."""
+"""The magnet is holding the vehicle: the thrust is low, and the vehicle is not slipping."""
 SLIPPING = Condition("slipping", is_slipping)
-"""The vehicle falls away from the proven contact."""
+"""The vehicle is falling away from the proven contact."""
 HANGING_WITH_MOTORS_STOPPED = Condition(
     "the whole weight hangs", _is_hanging_with_motors_stopped, required_data=RequiredData.TELEMETRY
 )
-"""The vehicle hangs with its motors stopped: its support carries the whole weight, and the vehicle
-does not slip."""
+"""The vehicle is hanging with its motors stopped: its support carries the whole weight, and the
+vehicle is not slipping."""
 HANGING = Condition("hanging", _is_hanging, required_data=RequiredData.POSITION)
-"""Something holds the vehicle up, off the floor."""
+"""Something is holding the vehicle up, off the floor."""
 MOTORS_OFF_AS_COMMANDED = Condition(
     "motors stopped", _are_motors_off_as_commanded, required_data=RequiredData.TELEMETRY
 )
@@ -534,26 +534,27 @@ MOTORS_OFF_DESPITE_THRUST_COMMAND = Condition(
     required_data=RequiredData.TELEMETRY,
 )
 """The motors are off although the last command was raw thrust: the supervisor has ended the flight.
-The supervisor soon lets that command start them again (docs/firmware.md, "Supervisor")."""
+The supervisor will soon let that command start the motors again (docs/firmware.md,
+"Supervisor")."""
 ON_FLOOR = Condition("on the floor", _is_on_floor, required_data=RequiredData.POSITION)
-"""The vehicle stands on the floor."""
+"""The vehicle is on the floor."""
 CLIMB_BLOCKED = Condition("blocked", _is_pressing_against_obstacle)
-"""The vehicle presses against an obstacle below its setpoint."""
+"""The vehicle is pressing against an obstacle below its setpoint."""
 IMU_SHOWS_SUPPORT = Condition(
     "supported, by accelerometer and thrust",
     _does_imu_show_support,
     persists_across_phases=True,
     required_data=RequiredData.TELEMETRY,
 )
-"""Something supports the vehicle, or it presses against something: proven by accelerometer and
-thrust alone."""
+"""Something is supporting the vehicle, or it is pressing against something: proven by accelerometer
+and thrust alone."""
 THRUST_SATURATED_WITHOUT_CLIMB = Condition(
     "thrust at its limit",
     _is_thrust_saturated,
     persists_across_phases=True,
     required_data=RequiredData.TELEMETRY,
 )
-"""The thrust is at its limit, and the vehicle does not climb."""
+"""The thrust is at its limit, and the vehicle is not climbing."""
 SUPPORT_CONDITIONS = (
     TARGET_CONTACT,
     MAGNET_HOLDS_VEHICLE,
@@ -624,9 +625,9 @@ def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
     Two conditions are accepted without all of the data that they require. With the target as the
     only position source, `TARGET_CONTACT` needs no valid position during a press, because the last
     sighting is accurate enough for a while. During a descent, `HANGING` needs no position and
-    accepts telemetry as old as `safety.telemetry_hold_s`. Without this exception, a vehicle that
-    hangs on the magnet would keep its motors running while its telemetry is poor. The weight
-    transfer that then begins still needs fresh telemetry.
+    accepts telemetry as old as `safety.telemetry_hold_s`. If `HANGING` were not excepted, a vehicle
+    hanging on the magnet would keep its motors running while its telemetry is poor. The end of
+    the weight transfer that follows (`HANGING_WITH_MOTORS_STOPPED`) still needs fresh telemetry.
     """
     if condition is HANGING and b.command_history.maneuver.descends_to_floor:
         return b.attitude_age_s <= b.profile.safety.telemetry_hold_s

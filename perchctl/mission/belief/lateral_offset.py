@@ -43,7 +43,7 @@ estimate moves the vehicle."""
 MAX_AGE_OF_NEWEST_PICTURE_S = 0.5
 """Longest time between two pictures, and from the newest picture to a prediction, s. Larger: a gust
 moves the vehicle unnoticed. Smaller: the vehicle flies the last centimetres with the state estimate
-instead."""
+instead of this filter."""
 MIN_NIS_TO_RESTART_FILTER = 20.0
 """Normalized innovation squared (two degrees of freedom) above which a picture restarts the filter;
 by chance, one in 20,000 pictures exceeds it. Larger: after a jump of the pose, the velocity is

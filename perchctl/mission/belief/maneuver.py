@@ -16,7 +16,7 @@ class Maneuver:
     interpreted.
 
     The same reading has different meanings in different maneuvers: a motionless vehicle at low
-    thrust hangs after a press, but stands on the floor in a descent. Each phase declares its
+    thrust is hanging after a press, but is on the floor in a descent. Each phase declares its
     maneuver, so the belief does not need to know the phase.
 
     Attributes:
@@ -35,9 +35,10 @@ class Maneuver:
             maneuver is neither in free air nor guided by the camera, so no hold applies: a hold
             would leave the vehicle pressed.
         retreats_after_attempt: the vehicle leaves the position where an attempt ended. If something
-            still holds it there, its offset from the target is the offset of the last touch.
-        descends_to_floor: the vehicle descends. A supported vehicle hangs if it is still where the
-            descent began, and stands on the floor if it has come down.
+            is still holding the vehicle there, its offset from the target is the offset of the last
+            touch.
+        descends_to_floor: the vehicle descends. A supported vehicle is hanging if it is still where
+            the descent began, and is on the floor if it has come down.
     """
 
     is_in_free_air: bool = False

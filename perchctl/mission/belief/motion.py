@@ -41,8 +41,8 @@ MAX_TELEMETRY_GAP_S = 0.2
 a vehicle that still hangs can move. Larger: a gap can hide a fall. Smaller: two lost packets count
 as a gap."""
 MAX_SPEED_NOISE_ACROSS_GAP_MPS = 0.25
-"""Largest change of a hanging vehicle's vertical speed across a gap due to noise of the estimate,
-m/s. Larger: a short fall goes undetected."""
+"""Largest change in a hanging vehicle's vertical speed that noise of the estimate causes across a
+gap, m/s. Larger: a short fall goes undetected."""
 MAX_UNEXPLAINED_HEIGHT_CHANGE_IN_GAP_M = 0.25
 """Largest vertical movement across a gap that the speed before the gap does not explain, m. Larger:
 a short fall goes undetected."""
@@ -88,8 +88,8 @@ taken from this far back."""
 MAX_BOUNCE_TIME_AFTER_IMPACT_S = 0.5
 """Time after an impact within which a further impact is a bounce, s."""
 MAX_STEADY_CLIMB_RATE_DEVIATION_MPS = 0.06
-"""Largest difference between vertical speeds that count as constant, m/s. Larger: a slow sink
-counts as standing still."""
+"""Largest difference between vertical speeds that count as constant, m/s. Larger: a slowly sinking
+vehicle counts as motionless."""
 MAX_STEADY_LATERAL_VELOCITY_DEVIATION_MPS = 0.15
 """Largest difference between the lateral velocity and its mean over
 `MEAN_LATERAL_VELOCITY_TIME_CONSTANT_S` that counts as constant, m/s; larger than
@@ -106,7 +106,7 @@ MAX_PUSH_TO_ESTIMATE_RESPONSE_DELAY_S = 1.5
 """Longest time until a push shows in the state estimate, s."""
 LATERAL_PUSH_TIME_CONSTANT_S = 0.05
 """Time constant of the mean lateral force, s: the vibration of running motors affects single
-samples as much as a push."""
+samples as much as a push does."""
 MIN_VELOCITY_STEP_OF_ESTIMATE_CORRECTION_MPS = 0.08
 """Lateral speed gained between two samples above which it is a correction of the estimate and not a
 motion, m/s."""
@@ -229,7 +229,7 @@ class FallDetector:
     The upper bound keeps the end of a climb from counting as a fall. The vehicle falls if v <
     `MAX_CLIMB_RATE_GAINED_IF_FALLING_MPS` (a negative limit), or if the accelerometer has read less
     than `MAX_ACCELEROMETER_READING_IN_FREE_FALL_G` for `MIN_FREE_FALL_DURATION_S`, longer than a
-    rebound lasts. A slow sink goes undetected because it is learned as an offset.
+    rebound lasts. A slow descent goes undetected because it is learned as an offset.
     """
 
     last_fall_at_s: float = -math.inf  # last fall, or descent to the floor
@@ -473,7 +473,7 @@ class ImuMotion(
     # end of the newest gap that may hide a fall
     last_gap_that_may_hide_fall_ended_at_s: float = -math.inf
     vehicle_restarted_at_s: float = -math.inf  # first sample after the vehicle restarted
-    # change of the estimated height over the successive gaps until now; at most 0
+    # total change of the estimated height over the newest series of successive gaps; at most 0
     height_change_in_gap_m: float = 0.0
     mean_hover_thrust: float = 0.0  # mean thrust per measured g in flight
     # roll and pitch errors caused by corrections

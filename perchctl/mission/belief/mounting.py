@@ -1,4 +1,5 @@
-"""Verify that the camera is mounted as the profile says: the target must stand still in the world.
+"""Verify that the camera is mounted as the profile says: the target must be stationary in the
+world.
 
 If `camera.mount` is wrong by a rotation about the vehicle's upward axis, the target seems to move
 by (1 - M) times the motion of the point where that axis meets the target's plane; M is the rotation
@@ -24,7 +25,7 @@ MIN_JUDGED_MOTION_M, MIN_PROVEN_MOTION_M = 0.12, 0.3
 proven."""
 MAX_STATIONARY_RATIO, MIN_MOVING_RATIO = 0.35, 0.6
 """Ratio of the target's apparent motion to the vehicle's motion: below the first value, the target
-stands still; above the second, it moves with the vehicle. Undisturbed flights show 0.25 at most; a
+is stationary; above the second, it moves with the vehicle. Undisturbed flights show 0.25 at most; a
 camera rotated by a quarter turn shows 1.4."""
 MIN_MOVING_TARGET_POSITION_RMS_M = 0.05
 """Smallest RMS distance of the target's estimated world positions from their mean that shows that
@@ -97,11 +98,11 @@ class CameraMountingMonitor:
 
     sightings: tuple[CameraMountingSample, ...] = ()
     check_paused_until_s: float = -math.inf
-    # the target stood still while the vehicle moved `MIN_PROVEN_MOTION_M`: the check is complete
+    # the target was stationary while the vehicle moved `MIN_PROVEN_MOTION_M`: the check is complete
     is_camera_mounting_confirmed: bool = False
-    is_target_stationary: bool = False  # the target has stood still so far
+    is_target_stationary: bool = False  # the target has been stationary so far
     contradicting_sighting_count: int = 0  # successive sightings that contradict the mounting
-    # rotation of the mounting with which the target would stand still
+    # rotation of the mounting with which the target would be stationary
     camera_yaw_error_rad: float = 0.0
 
     @property
@@ -111,7 +112,7 @@ class CameraMountingMonitor:
 
     @property
     def is_target_motion_undetermined(self) -> bool:
-        """True until the vehicle has moved far enough to show whether the target stands still in
+        """True until the vehicle has moved far enough to show whether the target is stationary in
         the world, as it does if the mounting is right."""
         return not (self.is_camera_mounting_confirmed or self.is_target_stationary)
 

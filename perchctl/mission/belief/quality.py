@@ -56,7 +56,7 @@ LATERAL_SPEED_EXCEEDS_DRAUGHT = Condition[Belief](
         b.is_position_valid and math.hypot(*b.velocity_mps[:2]) > MAX_LATERAL_SPEED_FROM_DRAUGHT_MPS
     ),
 )
-"""The vehicle moves laterally faster than any draught can move it."""
+"""The vehicle is moving laterally faster than any draught can move it."""
 ESTIMATE_VARIANCE_TOO_LARGE = Condition[Belief](
     "variance too large", lambda b: b.is_estimate_variance_too_large, persists_across_phases=True
 )

@@ -42,9 +42,9 @@ MAX_ACCELERATION_BIAS_MPS2 = 1.5
 """Largest bias, m/s^2; a wind of 4 m/s, which the firmware mistakes for a tilt, causes 1.2. Larger:
 wrong positions can cause a bias larger than any attitude error."""
 MAX_ACCELERATION_BIAS_INNOVATION_MPS2 = 2.0
-"""Largest difference in one sample from which the bias is learned, m/s^2; a larger difference is
-due to an impact or a correction of the estimate. Larger: the effect of a 40 ms kick is learned.
-Smaller: a gust is not learned."""
+"""Largest difference between measured and estimated acceleration in one sample from which the bias
+is learned, m/s^2; a larger difference is due to an impact or a correction of the estimate. Larger:
+the effect of a 40 ms impact is learned. Smaller: a gust is not learned."""
 CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS = 0.1
 """Margin by which the vehicle may climb faster than dead reckoning says, m/s. Larger: the magnet
 seems to be in reach too early."""

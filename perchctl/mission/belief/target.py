@@ -105,16 +105,17 @@ class TargetBelief:
 class VisualMotion:
     """The vehicle's velocity from pictures of a stationary target, for use without telemetry.
 
-    The vehicle moves by -de/dt, where e is the target's position from the gear in the level frame;
-    a first-order low-pass filter smooths it. Only roll and pitch, which are used to level e, come
-    from the telemetry. If they are old, they add e_z dphi/dt to the lateral velocity while the
-    vehicle tilts, and little to the vertical velocity. The velocity is wrong if the target moves;
-    its lateral part is wrong if the camera's mounting differs from the profile.
+    The vehicle moves by -de/dt, where e is the target's position relative to the gear in the level
+    frame; a first-order low-pass filter smooths it. Only roll and pitch, which are used to level e,
+    come from the telemetry. If roll and pitch are old, they add e_z dphi/dt to the lateral velocity
+    while the vehicle tilts, and little to the vertical velocity. The velocity is wrong if the
+    target moves; its lateral part is wrong if the camera's mounting differs from the profile.
 
     Attributes:
         t_s: exposure time of the newest detection.
         detection_began_at_s: exposure time of the first detection after the last gap.
-        gear_to_target_level_m: newest position of the target from the gear (ahead, left, up), m.
+        gear_to_target_level_m: newest position of the target relative to the gear (ahead, left,
+            up), m.
         vehicle_velocity_level_mps: velocity of the vehicle (ahead, left, up), m/s.
     """
 
@@ -125,7 +126,7 @@ class VisualMotion:
 
     @property
     def is_velocity_known(self) -> bool:
-        """True if the target was detected for long enough to determine the velocity."""
+        """True if the target has been detected for long enough to determine the velocity."""
         return self.t_s - self.detection_began_at_s >= MIN_DETECTION_TIME_TO_KNOW_VELOCITY_S
 
     def with_detection(self, target: TargetEstimate) -> VisualMotion:

@@ -194,8 +194,8 @@ def _reset_after_tick_gap(b: Belief) -> Belief:
     kept: dict[Condition[Any], float] = keep_persistent_start_times(b.condition_start_times_s)
     off_s = max(imu.motors_stopped_at_s, imu.last_telemetry_gap_ended_at_s)
     if MOTORS_OFF_AS_COMMANDED in b.condition_start_times_s and math.isfinite(off_s):
-        # All samples from the gap have arrived, and the motors are off in each. Without this
-        # exception, a loop with a gap in every tick would never see the end of a landing.
+        # All samples from the gap have arrived, and the motors are off in each. If this condition
+        # restarted as well, a loop with a gap in every tick would never see the end of a landing.
         kept[MOTORS_OFF_AS_COMMANDED] = max(
             off_s, b.condition_start_times_s[MOTORS_OFF_AS_COMMANDED]
         )
@@ -300,10 +300,10 @@ def _update_dead_reckoning(b: Belief) -> Belief:
 def _integrate_dead_reckoning(b: Belief) -> DeadReckoning:
     """Return the dead reckoning advanced by the newest sample of accelerometer and state estimate.
 
-    While the vehicle is in free air, the estimate is trusted and external positions still correct
-    its velocity, the bias of that velocity is learned as well; otherwise, the low-pass filters for
-    this bias restart. With a deck or motion capture, unexplained steps of a trusted position are
-    accumulated.
+    The bias of the estimated velocity is learned as well while three conditions are met: the
+    vehicle is in free air, the estimate is trusted, and external positions still correct the
+    estimated velocity. Otherwise, the low-pass filters for this bias restart. With a deck or motion
+    capture, unexplained steps of a trusted position are accumulated.
     """
     obs, source = b.obs, b.profile.positioning.source
     is_estimate_trusted = (

@@ -1,7 +1,7 @@
 """Phase 4, ALIGN: move under the target at constant height, and turn to its heading.
 
-In a fleet, the vehicle waits here, below its target, until the parent permits the climb. The ascent
-continues even if the permission is withdrawn later.
+In a fleet, the vehicle waits here, below its target, until the fleet's parent process permits the
+climb. The ascent continues even if the permission is withdrawn later.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from perchctl.mission.transition import Transition, back_off_row, land_row
 MAX_WAIT_FOR_CLIMB_PERMISSION_S = 20.0
 """Longest wait for permission to climb, s, from the entry into the phase or the end of a hold;
 `planner.perching_time_s` limits the total. Larger: the battery of a vehicle without permission runs
-down. Smaller: a neighbour also ends this flight if it blocks the climb only briefly, while it lands
-or until the parent has ended its unresponsive process."""
+down. Smaller: this flight also ends if a neighbour blocks the climb only briefly, while the
+neighbour lands or until the parent process has ended the neighbour's unresponsive process."""
 
 ALIGNED = Condition[Context](
     "aligned",
@@ -42,7 +42,7 @@ ALIGNED = Condition[Context](
 CLIMB_WITHHELD = Condition[Context](
     "climb withheld", lambda c: c.obs.climb_withheld_reason is not None
 )
-"""The fleet's parent does not permit the climb."""
+"""The fleet's parent process does not permit the climb."""
 
 
 def act_in_align(c: Context) -> Action:

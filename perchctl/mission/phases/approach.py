@@ -12,9 +12,9 @@ from perchctl.mission.transition import Transition, land_row
 from perchctl.vehicle import PositionSetpoint
 
 MIN_HEIGHT_TO_CORRECT_HEIGHT_SETPOINT_M = 0.1
-"""Height below which the vehicle may still stand on the ground, m; the height is not corrected
-there. Larger: a heavy vehicle stays near the ground for longer. Smaller: a vehicle that is still on
-the ground jumps up."""
+"""Height below which the vehicle may still be on the ground, m; the height is not corrected there.
+Larger: a heavy vehicle stays near the ground for longer. Smaller: a vehicle that is still on the
+ground jumps up."""
 MIN_TAKEOFF_HEIGHT_FRACTION_FOR_LATERAL_APPROACH = 0.7
 """Fraction of the take-off height above which the vehicle flies to `planner.approach_xy_m`."""
 MIN_TAKEOFF_HEIGHT_FRACTION_TO_END_TAKEOFF = 0.8

@@ -42,7 +42,7 @@ def enter_complete(state: PlannerState, previous_context: Context) -> PlannerSta
 
 def act_in_complete(c: Context) -> Action:
     """Transfer the weight from the rotors to the magnet in two stages (the release), stop the
-    motors once the whole weight hangs, and monitor the vehicle."""
+    motors once the magnet carries the whole weight, and monitor the vehicle."""
     if c.state.motor_stop_commanded_at_s is not None:
         return stop_motors(c)
     holds = c.true_for_s(MAGNET_HOLDS_VEHICLE) >= c.planner.complete.hold_dwell_s

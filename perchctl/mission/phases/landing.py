@@ -42,7 +42,7 @@ def enter_landing(state: PlannerState, previous_context: Context) -> PlannerStat
     ):
         # no evidence of a support at that position
         b = replace(b, gear_to_target_at_last_contact=None)
-    # With a wrong mounting, the setpoint leads the vehicle in a wrong direction.
+    # With a wrong mounting, the setpoint leads the vehicle in the wrong direction.
     setpoint = None if VehicleDiagnosis.CAMERA_MOUNTING_WRONG in diagnosis else state.setpoint
     return enter_descent(replace(state, belief=b, setpoint=setpoint), previous_context.state)
 

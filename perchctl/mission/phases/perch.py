@@ -30,7 +30,8 @@ from perchctl.mission.transition import Transition, back_off_row
 from perchctl.vehicle import RawThrust
 
 LATERAL_SPEED_EXCEEDS_DRAUGHT_DWELL_S = 0.04
-"""Time for which the vehicle must move laterally, s: more than one telemetry sample."""
+"""Time for which the vehicle must move laterally faster than any draught can move it before the
+attempt ends, s: more than one telemetry sample."""
 MAX_PRESS_DURATION_WITHOUT_SIGHTING_S = 1.25
 """Longest press after the last sighting, s. The vehicle flies the last centimetres without the
 target in view; with the target as the only position source, it flies them by dead reckoning.

@@ -7,9 +7,9 @@ edge does not move the centroid:
     e = sum(w g u) / sum(w g)
 
 The window pulls the centroid towards the window's middle by a known factor, and a neighbouring edge
-one cell away adds a known share to it. Both effects are corrected. The edge points x of a side are
-undistorted, a line n.x = c is fitted to them by total least squares with Tukey's weights, and
-neighbouring lines are intersected:
+one cell away adds a known share to it. The effects of the window and of the neighbouring edge are
+corrected. The edge points x of a side are undistorted, a line n.x = c is fitted to them by total
+least squares with Tukey's weights, and neighbouring lines are intersected:
 
     min over |n| = 1 of sum w_k (n.x_k - c)^2,    n_a.p = c_a,  n_b.p = c_b
 
@@ -23,9 +23,10 @@ lines are moved back by d.
 
 The result is wrong if the white of only some sides is clipped, if a cell is only two or three times
 as wide as the blur and its neighbours bend the sides, or if the sheet is curled. The standard
-deviation covers the first two cases. `refine_corners_by_lines` returns None for a marker if a
-corner moved by more than 0.6 cells (and by more than 1.6 px), if the edge points deviate from their
-line by 0.6 px, if less than half of the profiles are inliers, or if the blur fills the window.
+deviation of the corners allows for partial clipping and for narrow cells. `refine_corners_by_lines`
+returns None for a marker if a corner moved by more than 0.6 cells (and by more than 1.6 px), if the
+edge points deviate from their line by 0.6 px, if less than half of the profiles are inliers, or if
+the blur fills the window.
 
 Lengths are in image pixels; lines and points are in normalised image coordinates.
 """

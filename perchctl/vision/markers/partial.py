@@ -78,7 +78,7 @@ _MIN_EDGE_SHIFT_SIGMA_PX = 0.01
 # Robust weights make the squared residuals smaller; this factor compensates for it.
 _ROBUST_VARIANCE_FACTOR = 1.3
 _MAX_HOMOGRAPHY_INCREMENT = 0.5
-# Three search windows: the edges cannot move a fit further from its start.
+# Three times the reach of a search window; the edges cannot move a fit further from its start.
 _MAX_MOTION_FROM_START_PX = 20.0
 
 
