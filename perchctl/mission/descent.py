@@ -110,7 +110,7 @@ QUINTIC_PEAK_TO_MEAN_SPEED_RATIO = 1.875
 MAX_HEIGHT_DRIFT_IN_LANDING_GOAL_M = 1.0
 """Largest assumed drift of the height, m."""
 MAX_SPECIFIC_FORCE_IN_FALL_G = 0.5
-"""Specific force below which the vehicle falls, g: no floor supports it."""
+"""Specific force below which the vehicle is falling, g: no floor is supporting it."""
 MAX_SINK_RATE_OF_DROP_ONTO_FLOOR_MPS = 1.0
 """Largest speed of a drop from 5 cm above the floor, m/s."""
 MIN_MIDAIR_MOTOR_CUT_HEIGHT_M = 0.4

@@ -8,8 +8,8 @@ setpoint. Then
 
 is a proportional rate controller. The gain k falls with the age of v; otherwise, the vehicle would
 oscillate. With old telemetry and the target in view, v is the climb rate from pictures. While the
-vehicle does not sink, the thrust is reduced until it sinks, the magnet lets go, or the floor is
-detected. Laterally, the vehicle leans against the wind and brakes
+vehicle is not sinking, the thrust is reduced until the vehicle sinks, the magnet lets go, or the
+floor is detected. Laterally, the vehicle leans against the wind and brakes
 (`_compute_braking_roll_pitch_rad`).
 """
 
@@ -59,14 +59,14 @@ the tilt itself looks like a motion. Smaller: it drifts further."""
 SETTLING_DURATION_AT_CONSTANT_SETPOINT_S = 0.6
 """Time at a constant setpoint after which the vehicle has come to rest, s."""
 THRUST_RAMP_DOWN_RATE_HOVER_FRACTION_PER_S = 0.25
-"""Rate at which the thrust of a vehicle that does not sink is reduced, as a fraction of the hover
+"""Rate at which the thrust of a vehicle that is not sinking is reduced, as a fraction of the hover
 thrust per second. Larger: the vehicle hits the floor faster. Smaller: a magnet holds it for
 longer."""
 CAMERA_GUIDED_RAMP_DOWN_HOVER_FRACTION_PER_S = 0.1
-"""Rate at which the thrust of a vehicle that does not sink is reduced in a descent by pictures, as
-a fraction of the hover thrust per second; pictures show only after a quarter of a second that the
-vehicle sinks. Larger: the vehicle falls at first. Smaller: the vehicle is on the floor for longer
-with its motors running."""
+"""Rate at which the thrust of a vehicle that is not sinking is reduced in a descent by pictures, as
+a fraction of the hover thrust per second; pictures take a quarter of a second to show that the
+vehicle is sinking. Larger: the vehicle falls at first. Smaller: the vehicle is on the floor for
+longer with its motors running."""
 MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS = 0.05
 """Sink rate, from the telemetry and the commands since its newest sample, below which the vehicle
 counts as not sinking, m/s."""
@@ -78,7 +78,7 @@ BRAKE_TILT_GAIN_RAD_PER_MPS = 0.25
 """Tilt per lateral speed, rad per m/s."""
 MAX_VISUAL_VELOCITY_AGE_S = 0.5
 """Largest age of a lateral speed from pictures that the vehicle still brakes, s. Larger: after the
-last picture, the vehicle keeps leaning against a speed that no longer exists. Smaller: a few lost
+last picture, the vehicle keeps tilting to brake a speed that no longer exists. Smaller: a few lost
 pictures end the braking."""
 MAX_BRAKE_TILT_RAD = 0.22
 """Largest tilt that brakes the lateral speed, rad; it costs 2.5 % of the thrust."""
@@ -225,7 +225,8 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
     # In the air, the accelerometer reading is proportional to the thrust; on the floor, it is 1 g.
     falls = b.is_imu_fresh and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover_thrust)
     if touched_s >= TOUCHDOWN_THRUST_DURATION_S and falls:
-        floor_detected_at_s = None  # the vehicle falls at low thrust, so it did not touch the floor
+        # the vehicle is falling at low thrust, so it did not touch the floor
+        floor_detected_at_s = None
     carried = (
         b.is_imu_fresh
         and tel.acc_z_g > MIN_SPECIFIC_FORCE_IF_SUPPORTED_G
@@ -286,9 +287,9 @@ def _find_floor_detection_time_s(
 ) -> float | None:
     """Return the time at which the floor was first detected; None if it was not.
 
-    The floor is detected by an impact from below while the vehicle sank, or by pictures that show
-    no motion at a thrust too low to support the vehicle. `is_sinking`: the measured speed shows a
-    descent.
+    The floor is detected by an impact from below while the vehicle was sinking, or by pictures that
+    show no motion at a thrust too low to support the vehicle. `is_sinking`: the measured speed
+    shows a descent.
     """
     descent, b, seen = c.state.descent, c.belief, _visual_motion_if_telemetry_old(c)
     if descent.floor_detected_at_s is not None:

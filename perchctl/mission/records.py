@@ -26,7 +26,7 @@ class EventKind(Enum):
     """The kind of an `Event`."""
 
     PHASE = "phase"  # the mission entered a phase
-    HOLD = "hold"  # the vehicle holds its position
+    HOLD = "hold"  # the vehicle is holding its position
     NOTE = "note"  # other noteworthy information
 
 
@@ -132,7 +132,7 @@ class FrameRecord:
     t_arrival_s: float
     picture_kind: PictureKind | None = None
     is_repeated: bool = False
-    # checksum of the picture; None if it was not searched or not recorded
+    # checksum of the picture; None if the picture was not searched or not recorded
     checksum: int | None = None
 
 

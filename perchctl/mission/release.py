@@ -105,9 +105,9 @@ def reduce_press_before_weight_transfer(c: Context) -> Action:
     """Perform the first stage of the release, which transfers the weight from the rotors to the
     magnet.
 
-    Lower the setpoint in steps to `complete.release_drop_m` below the contact until the magnet is
-    seen to carry the vehicle. In a press by raw thrust, lower the thrust to just below the holding
-    thrust instead.
+    Lower the setpoint in steps to `complete.release_drop_m` below the contact until the
+    measurements show that the magnet carries the vehicle. In a press by raw thrust, lower the
+    thrust to just below the holding thrust instead.
     """
     complete, perch, state, b = c.planner.complete, c.planner.perch, c.state, c.belief
     step = min(complete.steps, 1 + int(c.time_in_phase_s / complete.release_s * complete.steps))
@@ -232,8 +232,8 @@ def choose_catch_setpoint_height_above_vehicle_m(
 
 
 def catch_falling_vehicle(c: Context) -> Action | None:
-    """Catch a vehicle that falls off the magnet: return a setpoint high above it. None if there is
-    nothing to catch, once the fall has ended, or with old telemetry."""
+    """Catch a vehicle that is falling off the magnet: return a setpoint high above it. None if
+    there is nothing to catch, once the fall has ended, or with old telemetry."""
     state, tel, b = c.state, c.telemetry, c.belief
     if state.catch_setpoint_height_above_vehicle_m is None or not b.is_imu_fresh:
         return None

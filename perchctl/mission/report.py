@@ -179,7 +179,7 @@ class FlightReport:
     is_locked_by_supervisor: bool
     history: tuple[Event, ...] = ()  # events of the phases, from the start of the flight
     findings: CameraFindings | None = None  # latency and mounting, if the flight was long enough
-    gear_to_target_at_last_contact: GearToTargetDistance | None = None  # None unless it hangs
+    gear_to_target_at_last_contact: GearToTargetDistance | None = None  # None unless it is hanging
     touchdown: Touchdown | None = None  # touchdown of a vehicle that reached the floor
     hover: HoverReport | None = None  # the newest hover of a mission that hovers
     # one sentence for each watcher detached after an exception

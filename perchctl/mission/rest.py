@@ -112,11 +112,11 @@ def _find_rest_state_from_falls(c: Context) -> RestState:
 def is_still_hanging(c: Context) -> bool:
     """True if the vehicle is still hanging.
 
-    With a recorded contact and a valid position from a deck or motion capture, the vehicle hangs if
-    it does not sink faster than `complete.slip_mps` and is at most
-    `MAX_HEIGHT_DRIFT_BELOW_CONTACT_IF_HANGING_M` below its contact. Failing that, it hangs if the
-    accelerometer has measured no fall since it came within the magnet's reach and no gap can hide
-    one (`_find_rest_state_from_falls`).
+    With a recorded contact and a valid position from a deck or motion capture, the vehicle is
+    hanging if it is not sinking faster than `complete.slip_mps` and is at most
+    `MAX_HEIGHT_DRIFT_BELOW_CONTACT_IF_HANGING_M` below its contact. Failing that, it is hanging if
+    the accelerometer has measured no fall since it came within the magnet's reach and no gap can
+    hide one (`_find_rest_state_from_falls`).
     """
     b, tel = c.belief, c.telemetry
     if (

@@ -334,7 +334,7 @@ def is_thrust_insufficient_for_press(c: Context) -> bool:
 
 
 def _outcome_after_supervisor_lock(previous_outcome: Outcome | None) -> Outcome:
-    """Return the outcome if the supervisor has locked a vehicle that hangs. HOVERED becomes SAFETY,
+    """Return the outcome if the supervisor has locked a hanging vehicle. HOVERED becomes SAFETY,
     since a hover must end on the floor; any other outcome is kept; without an outcome, the result
     is PERCHED."""
     return (

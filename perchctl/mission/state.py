@@ -130,7 +130,7 @@ class PlannerState:
     stop_or_land_command_count: int = 0
     commanded_raw_thrust: int | None = None  #: last commanded raw thrust; None in position mode
     descent: LevelDescentState = LevelDescentState()
-    hold_reason: str = ""  #: why the vehicle holds its position; empty without a hold
+    hold_reason: str = ""  #: why the vehicle is holding its position; empty without a hold
     waiting_reason: str = ""  #: why a row keeps the mission in its phase; empty if none does
     total_wait_in_phase_s: float = 0.0  #: total waiting time in this phase
     battery: BatteryOutlook = BatteryOutlook()

@@ -198,7 +198,7 @@ _MIN_RIVAL_ROTATION_TO_REPORT_RAD = math.radians(15.0)
 # Limits of a hovering vehicle's motion relative to the target during a jump of the estimate.
 _MAX_CALM_DURATION_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
 # A jump of the state estimate, or a wrong last pose, is accepted as an explanation if it reduces
-# the squared innovation to less than this fraction.
+# the squared innovation to less than this fraction of its value.
 _MAX_COST_RATIO_TO_ALTERNATIVE = 0.25
 
 

@@ -491,8 +491,8 @@ class Belief:
 
     @property
     def is_possibly_in_magnet_reach(self) -> bool:
-        """True if the magnet may hold the vehicle: after a contact, or once dead reckoning places
-        the gear within its reach."""
+        """True if the magnet may be holding the vehicle: after a contact, or once dead reckoning
+        places the gear within the magnet's reach."""
         return (
             self.vehicle_world_z_at_last_contact_m is not None
             or self.magnet_reach_entered_at_s is not None

@@ -4,9 +4,9 @@ The vehicle has no force sensor, so a contact is inferred from thrust, accelerom
 together. In the air, thrust minus weight accelerates the vehicle. If the vehicle is supported or
 pressed, its accelerometer reads 1 g and it does not move, whatever its thrust. A vehicle at rest
 whose accelerometer reads 1 g is therefore in contact with something if its thrust is far from hover
-thrust: with more thrust, the vehicle presses; with less thrust, something supports the vehicle. The
-vehicle's position and its maneuver then distinguish the magnet from the floor, and both from
-another object.
+thrust: with more thrust, the vehicle is pressing; with less thrust, something is supporting the
+vehicle. The vehicle's position and its maneuver then distinguish the magnet from the floor, and
+both from another object.
 
 One threshold decides whether the thrust exceeds hover thrust (`is_thrust_above_hover`). A vehicle
 at rest with that thrust is pressing (`is_pressing`): against the target if it is at the target's
@@ -74,8 +74,8 @@ MAX_HEIGHT_DRIFT_RATE_IN_PRESS_MPS = 0.1
 """Rate at which a pressed vehicle's estimated height may drift, m/s. Larger: a contact far from the
 target is accepted. Smaller: a true contact is rejected if the last sighting is old."""
 MIN_SETPOINT_HEIGHT_ABOVE_VEHICLE_TO_PRESS_M = 0.08
-"""Distance of the setpoint above a motionless vehicle from which the vehicle presses against
-whatever blocks it, m. Larger: a blocked climb is detected late."""
+"""Distance of the setpoint above a motionless vehicle from which the vehicle must be pressing
+against whatever blocks it, m. Larger: a blocked climb is detected late."""
 GEAR_DISPLACEMENT_BY_TOUCH_SIGMA_M = 0.001
 """Standard deviation of the distance by which the touch itself moves the gear, m."""
 LATERAL_SPEED_SIGMA_BEFORE_TOUCH_MPS = 0.02
@@ -585,8 +585,8 @@ class Support(Enum):
 def find_support(b: Belief) -> Support:
     """Return what supports the vehicle, from the conditions that are true in this tick.
 
-    A vehicle hangs on the magnet only if its gear is certainly within the magnet's radius. It hangs
-    on another object only if the gear is certainly outside that radius or certainly below the
+    The result is MAGNET only if the gear is certainly within the magnet's radius. It is
+    HELD_BY_OTHER_OBJECT only if the gear is certainly outside that radius or certainly below the
     target. (The gear cannot be above the target, because the ceiling is there: such an estimate is
     wrong and proves nothing.) In all other cases, the support is UNKNOWN, and a row of the
     transition table must assume the more dangerous of the possible supports.

@@ -8,8 +8,8 @@ the gear to the target, the vehicle's velocity v, and the acceleration a due to 
 
     de/dt = -v        dv/dt = a + w        picture: e + n_e        state estimate: v + n_v
 
-w is white noise (gusts, fluctuations of the thrust, an error of the mean tilt), n_e is the noise of
-a picture's pose, and n_v is the noise of the estimated velocity. Pictures arrive late, so the
+w is white noise (gusts, thrust fluctuations, an error of the mean tilt), n_e is the noise of a
+picture's pose, and n_v is the noise of the estimated velocity. Pictures arrive late, so the
 filter's state stays at the exposure time of the newest picture. The filter keeps the telemetry
 samples since then and uses them to predict the state at a later time.
 """

@@ -226,7 +226,7 @@ class FallDetector:
         v' = min(FALL_DETECTOR_MAX_CLIMB_RATE_GAINED_MPS,
                  v + a dt - v dt / FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S)
 
-    The upper bound keeps the end of a climb from counting as a fall. The vehicle falls if v <
+    The upper bound keeps the end of a climb from counting as a fall. The vehicle is falling if v <
     `MAX_CLIMB_RATE_GAINED_IF_FALLING_MPS` (a negative limit), or if the accelerometer has read less
     than `MAX_ACCELEROMETER_READING_IN_FREE_FALL_G` for `MIN_FREE_FALL_DURATION_S`, longer than a
     rebound lasts. A slow descent goes undetected because it is learned as an offset.

@@ -54,7 +54,7 @@ class HoverThrust:
     def is_imprecise(self) -> bool:
         """True if the relative standard deviation of the hover thrust exceeds
         `MAX_PRECISE_HOVER_THRUST_SIGMA_FRACTION`: neither quiet flight nor a descent has measured
-        the hover thrust well enough. True while the hover thrust is unknown."""
+        the hover thrust well enough. Also true while the hover thrust is unknown."""
         return self.sigma_fraction > MAX_PRECISE_HOVER_THRUST_SIGMA_FRACTION
 
     def propagate(self, dt_s: float, drift_fraction_per_sqrt_s: float) -> HoverThrust:

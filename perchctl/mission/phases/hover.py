@@ -37,8 +37,9 @@ back needlessly."""
 SUNK_BELOW_HOVER_HEIGHT_DWELL_S = 0.3
 """Time for which the vehicle must be too low before it climbs back, s."""
 MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S = 5.0
-"""Longest duration of a climb back after which the hover timer continues, s. Larger: a weak vehicle
-counts as hovering although it is too low. Smaller: a climb in wind restarts the timer."""
+"""Longest duration of a climb back to the hover position after which the hover timer continues, s.
+Larger: a weak vehicle counts as hovering although it is too low. Smaller: a climb in wind restarts
+the timer."""
 MAX_HOVER_HEIGHT_ERROR_M = 0.15
 """Vertical distance from the hover position beyond which the vehicle has left it, m. Larger: a
 vehicle that sinks or rises still counts as hovering. Smaller: a gust restarts the timer."""

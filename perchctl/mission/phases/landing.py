@@ -75,8 +75,8 @@ def unconfirmed_landing_reason(c: Context) -> str:
 
 def _outcome_after_hanging(previous_outcome: Outcome | None) -> Outcome | None:
     """Return the outcome of a flight that ends on the magnet. TARGET_NOT_FOUND becomes
-    ATTEMPTS_USED_UP, since the vehicle hangs on a target; HOVERED becomes SAFETY, since a hover
-    must not end on the magnet; other outcomes are kept."""
+    ATTEMPTS_USED_UP, since the vehicle is hanging on a target; HOVERED becomes SAFETY, since a
+    hover must not end on the magnet; other outcomes are kept."""
     if previous_outcome is Outcome.HOVERED:
         return Outcome.SAFETY
     return (

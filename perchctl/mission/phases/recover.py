@@ -35,7 +35,7 @@ from perchctl.values import replace
 from perchctl.vehicle import PositionSetpoint
 
 MIN_THRUST_TO_HOVER_RATIO_TO_SKIP_CATCH = 0.85
-"""Fraction of the hover thrust above which a slipping vehicle sinks so slowly that it needs no
+"""Fraction of the hover thrust above which a slipping vehicle is sinking so slowly that it needs no
 catch."""
 MIN_DISTANCE_BELOW_CONTACT_TO_RECOVER_M = 0.05
 """Distance below the contact beyond which the vehicle has left it, m; at most half of the descent
@@ -54,7 +54,7 @@ STEADY_AFTER_ATTEMPT = Condition[Context](
 
 
 def enter_recover(state: PlannerState, previous_context: Context) -> PlannerState:
-    """Record the last touch, and prepare a catch if the vehicle falls."""
+    """Record the last touch, and prepare a catch if the vehicle is falling."""
     old, b, diagnosis = previous_context.state, previous_context.belief, state.entry.diagnosis
     z_m, thrust = b.telemetry.position_m[2], b.telemetry.thrust
     touched = old.phase is Phase.PERCH or VehicleDiagnosis.BLOCKED_BY_OBSTACLE in diagnosis

@@ -7,9 +7,9 @@ edge does not move the centroid:
     e = sum(w g u) / sum(w g)
 
 The window pulls the centroid towards the window's middle by a known factor, and a neighbouring edge
-one cell away adds a known share to it. The effects of the window and of the neighbouring edge are
-corrected. The edge points x of a side are undistorted, a line n.x = c is fitted to them by total
-least squares with Tukey's weights, and neighbouring lines are intersected:
+one cell away contributes a known share to it. The effects of the window and of the neighbouring
+edge are corrected. The edge points x of a side are undistorted, a line n.x = c is fitted to them by
+total least squares with Tukey's weights, and neighbouring lines are intersected:
 
     min over |n| = 1 of sum w_k (n.x_k - c)^2,    n_a.p = c_a,  n_b.p = c_b
 
