@@ -149,8 +149,8 @@ class Replay:
             )
         if self.log.truncated:
             found.append(
-                "the log ends during the flight, without its summary: only the part that "
-                "it contains was replayed"
+                "the log ends during the flight, without its summary: only the recorded "
+                "part was replayed"
             )
         ended = "" if self.seen is None else self.seen.end_reason
         found += [note for note in (self.gap_text, ended) if note]
@@ -279,7 +279,7 @@ def replay_pipeline(log: FlightLog, profile: Profile, changed: Sequence[str] = (
         return make_pipeline(profile, camera, log.flown_mask(camera))
     except ValueError as error:
         raise InvalidValue(
-            f"{log.path}: the flown mask does not fit the calibration: {error}"
+            f"{log.path}: the mask used in the flight does not fit the calibration: {error}"
         ) from None
 
 

@@ -15,7 +15,7 @@ HELD_LEAST_S = 0.1
 FLYING = frozenset(phase.value for phase in Phase if phase.is_before_landing)
 TOOK_OVER = {
     "watchdog": "The watchdog took over",
-    "rescue": "After an error, the rescue took over",
+    "rescue": "After an error, the rescue routine took over",
     "reconnect": "The link was reopened",
 }
 ACTIONS = {

@@ -504,7 +504,7 @@ def _distortion(found: _Found, named: str | None) -> tuple[str, NDArray[np.float
     if model is None:
         if given.size == 4 and "fisheye" not in found:  # OpenCV writes a fisheye flag, 0 or 1
             raise InvalidValue(
-                f"{key} has 4 numbers, which plumb_bob and fisheye both have: add "
+                f"{key} has 4 numbers, so the model may be plumb_bob or fisheye: add "
                 f"distortion_model with plumb_bob or equidistant"
             )
         model = "plumb_bob" if given.size < 8 else "rational_polynomial"

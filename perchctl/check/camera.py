@@ -220,7 +220,7 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
         )
     if rehearsal.target is None:
         return warned(
-            "the target was no longer in view at the end",
+            "the target was no longer in view at the end of the rehearsal",
             "see the rows lost frames and target, then check again",
         )
     if problem := GroundCriteria.moved_body(rehearsal.target_moved_m, profile):

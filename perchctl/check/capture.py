@@ -138,7 +138,9 @@ def mocap_rows_at_rest(samples: CaptureSamples, profile: Profile) -> list[Row]:
     places = samples.body_poses(config)
     if not places:
         others = sorted({name for frame in samples.frames for name in frame.bodies})
-        found = f"no rigid body {config.body!r}; it sees {', '.join(others) or 'none'}"
+        found = (
+            f"{config.label} sees no body {config.body!r}; it sees {', '.join(others) or 'none'}"
+        )
         body = failed(found, "correct positioning.body, or move the body into the cameras' view")
         return [
             first,
@@ -368,10 +370,10 @@ def comparison_finding(motion: PairedMotion | None, config: PositioningConfig) -
     others = "the name may belong to another body: correct positioning.body"
     if own_rad <= MOVED_RAD and motion.max_deviation_g <= MOVED_G:
         if way_m > MOVED_M or seen_rad > MOVED_RAD:
-            return failed(f"the {body} moves while the vehicle stands still", others)
+            return failed(f"the {body} moves while the vehicle does not", others)
         return skipped("the vehicle was not moved", HOW_TO_TURN)
     if seen_rad <= BODY_STILL_RAD and way_m <= BODY_STILL_M:
-        return failed(f"the vehicle moves while the {body} stands still", others)
+        return failed(f"the vehicle moves while the {body} does not", others)
     if way_m > HAND_REACH_M:
         found = f"the {body} moved by {way_m:.0f} m: the positions appear to be in millimetres"
         return failed(found, "set the unit of the motion-capture stream to metres")

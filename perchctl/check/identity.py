@@ -140,13 +140,15 @@ def _vehicle_finding(
                 f"it at its home, {stand.home_text}?"
             )
     except PerchError as error:
-        return failed(f"the vehicle's LEDs do not blink: {error.found}", "update its firmware")
+        return failed(
+            f"the vehicle's LEDs could not be made to blink: {error.found}", "update its firmware"
+        )
     if is_there:
-        return passed(f"you confirmed that the vehicle blinks at its home, {stand.home_text}")
+        return passed(f"you confirmed that the vehicle is blinking at its home, {stand.home_text}")
     return failed(
-        f"you did not confirm that the vehicle blinks at its home, {stand.home_text}",
-        "put each vehicle at its own home, or correct uri; if two vehicles blink, give one of them "
-        "another address",
+        f"you did not confirm that the vehicle is blinking at its home, {stand.home_text}",
+        "put each vehicle at its own home, or correct uri; if two vehicles are blinking, give "
+        "one of them another address",
     )
 
 
@@ -231,7 +233,10 @@ def _target_finding(view: View, ask: Ask | None) -> Finding:
         if ask is None or not stand.lookalikes:
             return passed(found)
         return _covered_finding(
-            view, own, ask, f"the camera of {stand.lookalikes[0]} would also see its target there"
+            view,
+            own,
+            ask,
+            f"the camera of {stand.lookalikes[0]} would see its own target at the same position",
         )
     anywhere = target.model_copy(update={"expected_xy_m": None})
     other_m = _target_place(view.rehearse(view.profile.model_copy(update={"target": anywhere})))

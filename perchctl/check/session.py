@@ -55,7 +55,7 @@ def check(options: FlyOptions, scope: CheckScope) -> Iterator[Row]:
     check_options(options)
     if options.has_own_link:
         raise UsageError(
-            "check talks to the vehicle through cflib, not through your own link "
+            "perchctl check talks to the vehicle through cflib, not through your own link "
             f"{options.uri}: name a vehicle with --uri"
         )
     calibrated = profile_camera(options.profile.camera)

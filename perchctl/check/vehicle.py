@@ -44,7 +44,7 @@ SELF_TEST, ESTIMATOR = "system.selftestPassed", "stabilizer.estimator"
 BY_FLY = "perchctl fly sends the positions, and waits until the estimate agrees with them"
 """Finding for a vehicle that gets its positions from motion capture or from the target."""
 ARMED_BY_FLY = "perchctl fly arms it after you confirm"
-UNREPORTED = "according to link.unreported, this vehicle does not report it"
+UNREPORTED = "this vehicle does not report this value (see link.unreported)"
 
 Wait = Callable[[float], None]
 
@@ -305,7 +305,7 @@ def _ground(vehicle: VehicleStatus, profile: Profile) -> Finding:
     if not profile.positioning.source.is_deck:
         return skipped(BY_FLY)
     if not all(math.isfinite(v) for v in t.position_m):
-        return failed("the position is not a number", "restart the vehicle")
+        return failed("the estimated position is not finite", "restart the vehicle")
     return problem_finding(GroundCriteria(t, profile).off_ground, f"at {t.position_m[2]:.2f} m")
 
 
@@ -393,11 +393,13 @@ def lift_finding(samples: Sequence[Telemetry]) -> Finding:
             "the position estimate does not follow the vehicle: check the light, the floor and the "
             "base stations"
         )
-        return failed(f"the vehicle moved, but the position only {found}", advice)
+        return failed(f"the vehicle moved, but its position estimate only {found}", advice)
     if rise_m < LIFT_CHECK_M:
         return skipped(f"{found}: not enough to judge", HOW_TO_LIFT)
     if abs(back_m) > BACK_M:
-        return warned(found, "if the vehicle was put back at the same place, its position drifts")
+        return warned(
+            found, "if the vehicle was put back at the same place, its position estimate drifts"
+        )
     return passed(found)
 
 

@@ -150,7 +150,7 @@ def mask(
     force: ForceOption = False,
     size: SizeOption = None,
 ) -> None:
-    """Find the parts of the image that the vehicle covers while you turn it in your hand."""
+    """While you turn the vehicle in your hand, find the parts of the image that it covers."""
     say_on_terminal("looking for the parts that the vehicle covers")
     pictures = _source(source)
     check_output(output, (".png",), force, "a mask")

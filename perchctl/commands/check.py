@@ -82,9 +82,9 @@ def check(
 ) -> int:
     """Check vehicle, camera, computer and profile on the ground, and report what is not fit to fly.
 
-    Each check passes, warns, fails, or is skipped if perchctl cannot find out. perchctl does
+    Each check passes, warns, fails, or is skipped if perchctl cannot evaluate it. perchctl does
     not arm the vehicle, and no motor turns. The exit code is 0 if no check fails, 10 if the vehicle
-    does not answer, 20 if the camera delivers no images, and 52 if any other check fails.
+    does not answer, 20 if the camera delivers no image, and 52 if any other check fails.
     """
     if cameras:
         say_on_terminal("listing the cameras")

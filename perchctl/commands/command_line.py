@@ -58,7 +58,7 @@ COMMANDS: dict[str, str] = {
         "Show a resolved profile with every key explained, or create one for your vehicle (new)."
     ),
     "fit-weights": (
-        "Fit the merge weights to poses with known ground truth, and verify that they help."
+        "Using ground truth, fit weights that merge both markers' poses, and verify that they help."
     ),
     "track": "Find the target in a camera stream, a video or images, without a vehicle.",
     "check": (

@@ -59,7 +59,7 @@ def fit(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> int:
-    """Fit the merge weights to poses with known ground truth, and verify that they help.
+    """Using ground truth, fit weights that merge both markers' poses, and verify that they help.
 
     Each CSV row describes one image. The columns are position (a number that identifies the
     place), t_s, and x_m, y_m, z_m and yaw_rad with each of the prefixes large_, small_ and
@@ -154,7 +154,7 @@ def _open_session(path: Path, frames: int) -> weights.SessionFile:
     if session.note:
         say(session.note)
     if session.done:
-        say(f"{session.path} already holds {session.done} positions")
+        say(f"{session.path} already contains {session.done} positions")
     return session
 
 

@@ -129,7 +129,7 @@ def identify_and_report(plan: fleets.FleetPlan, as_json: bool) -> int:
     real = [vehicle for vehicle in plan.fleet.vehicles if not vehicle.simulated]
     if real and not sys.stdin.isatty():
         raise UsageError(
-            f"--identify asks you whether {real[0].name} blinks, but the input is not a "
+            f"--identify asks you whether {real[0].name} is blinking, but the input is not a "
             f"terminal: run the command in a terminal"
         )
     if not as_json:

@@ -89,9 +89,9 @@ def _opened(path: Path) -> Iterator[records.FlightLog]:
 def show(file: LogArgument = None, as_json: JsonOption = False) -> None:
     """Show, plot, compare, export, replay, film or summarise a flight from its log.
 
-    All subcommands read logs of real and simulated flights, of flights that were killed, and of
-    older perchctl versions. Only replay needs complete turn records, which log versions 1 and 2 do
-    not contain.
+    All subcommands read the logs of real and simulated flights, even if perchctl was killed in
+    flight, and the logs of older perchctl versions. Only replay needs complete tick records, which
+    log versions 1 and 2 do not contain.
     """
     with _opened(_log_file(file)) as log:
         flight = analysis.FlightAnalysis(log)

@@ -131,7 +131,7 @@ def design(
     blur: BlurOption = 1.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute the range in which the camera sees each marker, and any gap between them."""
+    """Compute the distances at which each marker can be read, and any at which neither can."""
     say_on_terminal(f"reading profile {profile}")
     config = profiles.load_profile(profile)
     path = profiles.find_calibration(camera or config.camera.calibration)

@@ -103,7 +103,7 @@ WORDS: dict[str, str] = {
     "aideck://HOST",
     "camera.calibration": "The camera's calibration file, from perchctl calibrate",
     "camera.latency_s": "Latency of the image, from exposure to arrival (often 60 to 100 ms),\n"
-    "or measured, to have each flight measure it",
+    "or the word measured, to have each flight measure it",
     "front": "Move a hand over the front of the vehicle. At which edge of the image does it\n"
     "appear: top, right, bottom or left?",
     "left": "Move a hand over the left side of the vehicle. At which edge of the image does\n"

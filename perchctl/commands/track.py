@@ -95,7 +95,7 @@ def track(
                   target's; otherwise empty
 
     If both markers are in view, target is their joint pose. Except for still images, target is
-    filtered, and continues for a few frames after stage becomes none. yaw_rad is
+    filtered, and is predicted for a few more frames after stage becomes none. yaw_rad is
     atan2(R[1,0], R[0,0]), the marker's heading in the image plane. sigma_m is along the camera's
     x, y and z axes.
 

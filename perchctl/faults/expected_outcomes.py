@@ -93,7 +93,7 @@ EXPECTED_OUTCOMES = (
     ),
     ExpectedOutcome(
         "lands alone",
-        "the vehicle's own landing continues without perchctl",
+        "a landing flown by the firmware continues without perchctl",
         _killed_in_landing,
         ("flies_on",),
         20.0,
@@ -106,12 +106,12 @@ EXPECTED_OUTCOMES = (
     ),
     ExpectedOutcome(
         "let go after the flight",
-        "the vehicle hung for as long as perchctl monitored it, then the magnet let go",
+        "the magnet failed after perchctl had finished monitoring the hanging vehicle",
         _let_go_later,
     ),
     ExpectedOutcome(
         "too low to catch",
-        "catching a fall takes up to 0.8 m of height; the vehicle hung below 1 m",
+        "recovering from a fall takes up to 0.8 m of height; the vehicle was hanging below 1 m",
         _too_low,
     ),
     ExpectedOutcome(
@@ -127,7 +127,7 @@ EXPECTED_OUTCOMES = (
     ),
     ExpectedOutcome(
         "sags too fast",
-        "the battery cannot lift the vehicle for as long as the descent takes",
+        "the battery cannot keep the vehicle in the air for the whole descent",
         _sagged_too_fast,
         within_s=15.0,
     ),

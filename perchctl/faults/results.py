@@ -14,11 +14,11 @@ from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES
 from perchctl.faults.oracle import FLAGS, NOT_KNOWN, UNCONFIRMED, Flag
 
 ENDS = {
-    "perched": "hangs on the magnet with its motors off",
-    "landed": "stands with its motors off",
+    "perched": "vehicle hanging on the magnet, motors off",
+    "landed": "vehicle on the ground, motors off",
     "aborted": "stopped by the operator, by the vehicle or for safety",
     "refused": "never took off",
-    "failed": "an exception ended the flight after the rescue",
+    "failed": "ended with an exception, after the rescue routine ran",
     "gone": "the program ended before the flight did",
 }
 """The ways in which a flight can end, and their meanings."""
@@ -76,7 +76,7 @@ class FaultResult(CampaignFlight):
 WORST_CASES = 20
 SHARES = {
     "wrong": "with a flag that counts against perchctl",
-    "not_known": "whether the vehicle hangs or stands",
+    "not_known": "vehicle either hanging or on the floor",
     "unconfirmed": "perchctl did not see the vehicle land",
 }
 """The counts that are given as shares of all flights, and what they mean."""

@@ -249,7 +249,10 @@ class Coordinator:
         if problem is None and silent_s > (START_HUNG_S if status is None else HUNG_S):
             problem = f"its process has not answered for {silent_s:.0f} s and was killed"
         elif problem is None and loop_age_s > LOOP_HUNG_S:
-            problem = f"its flight loop has hung for {loop_age_s:.0f} s, so it was killed"
+            problem = (
+                f"its flight loop has not responded for {loop_age_s:.0f} s, so its process was "
+                "killed"
+            )
         if problem is None:
             return None
         child.kill()

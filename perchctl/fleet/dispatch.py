@@ -253,14 +253,14 @@ def find_climb_obstacle(plan: FleetPlan, name: str, views: Sequence[VehicleView]
         place_m = places.get(other)
         if place_m is not None:
             if math.dist(place_m, target_m) < least_m:
-                return f"{other} is too close to its climb path"
+                return f"{other} is too close to this vehicle's climb path"
             continue
         lands = view.status is not None and view.status.phase is Phase.LANDING
         if other in places or lands or view.is_silent or not view.is_in_air:
             corridor = plan.corridors[other]
             lost = replace(corridor, radius_m=max(corridor.radius_m, TARGET_ALONE_M))
             if lost.distance_to_m(target_m) < least_m:
-                return f"the distance of {other} from its climb path is unknown"
+                return f"the distance of {other} from this vehicle's climb path is unknown"
     return None
 
 
@@ -273,16 +273,16 @@ def find_obstacle(plan: FleetPlan, name: str, ended: Mapping[str, Result]) -> st
         if other == name:
             continue
         if result.hangs:
-            place, where = vehicle.target_m, "hangs"
+            place, where = vehicle.target_m, "is hanging"
         elif is_at_home(vehicle, result):
-            place, where = vehicle.home_m, "stands"
+            place, where = vehicle.home_m, "is on the floor"
         elif not plan.schedule.may_fly_together(name, other):
             return f"{other} may be in this vehicle's corridor: its flight ended away from its home"
         else:
             continue
         away_m = corridor.distance_to_m(place)
         if away_m < OBSTACLE_M:
-            return f"{other} {where} {gap_text(away_m)} its corridor"
+            return f"{other} {where} {gap_text(away_m)} this vehicle's corridor"
     return None
 
 

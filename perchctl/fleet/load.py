@@ -205,7 +205,11 @@ def _check(where: str, vehicle: FleetVehicle) -> None:
     positioning, uri = vehicle.profile.positioning, vehicle.uri
     only = default_frame(vehicle.profile)
     if vehicle.frame != only and not positioning.source.is_deck:
-        axes = "the room's axes" if only == "room" else "axes whose origin is where it stands"
+        axes = (
+            "the room's axes"
+            if only == "room"
+            else "axes with their origin at its position before take-off"
+        )
         raise InvalidValue(
             f"{where}: frame: is {vehicle.frame}, but with positioning by {positioning.label} its "
             f"estimate uses {axes}: write {only}, or leave it out"

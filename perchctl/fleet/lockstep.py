@@ -333,9 +333,9 @@ class FleetFlight:
         `name`; empty if it is not. A vehicle at an unknown position (NaN) is always in the way."""
         place_m, result = self._known_m[other], self._results[other]
         hangs = result.outcome == "perched"
-        does = "hangs" if hangs else "lies"
+        does = "is hanging" if hangs else "is on the floor"
         if not all(map(math.isfinite, place_m)):
-            return f"it is unknown where {other} {does}"
+            return f"the position of {other} is unknown"
         gap_m = self._plan.corridors[name].distance_to_m(place_m)
         if gap_m < OBSTACLE_M:
             return f"{other} {does} {gap_text(gap_m)} this vehicle's corridor"
@@ -343,8 +343,8 @@ class FleetFlight:
         together = self._plan.schedule.may_fly_together(other, name)
         if not (hangs or together or away_m <= AT_HOME_M):
             return (
-                f"{other} lies {away_m:.2f} m from its home, in a corridor that is too close to "
-                "this vehicle's"
+                f"{other} is on the floor {away_m:.2f} m from its home, in a corridor that is "
+                "too close to this vehicle's"
             )
         return ""
 

@@ -301,7 +301,7 @@ def _advice(first: str, then: str, corridors: dict[str, Corridor]) -> str:
         f"radius of {least_m:.2f} m is enough instead of {radius_m:.2f} m"
     )
     return (
-        f"a vehicle that waits or hangs must be {OBSTACLE_M:g} m away from another vehicle's "
+        f"a waiting or hanging vehicle must be {OBSTACLE_M:g} m away from another vehicle's "
         f"corridor: move a home or target farther away{more if radius_m > least_m else ''}"
     )
 

@@ -251,8 +251,8 @@ class GroundCriteria:
         return self._off_the_ground(
             self.telemetry.position_m[2],
             "the state estimate places the vehicle at",
-            "if the vehicle hangs, take it down and restart it; if the positioning system has its "
-            "origin at another height, set safety.ground_z_m",
+            "if the vehicle is hanging, take it down and restart it; if the positioning system "
+            "has its origin at another height, set safety.ground_z_m",
         )
 
     def _off_the_ground(self, z_m: float, found: str, advice: str) -> Problem | None:
@@ -321,7 +321,8 @@ class GroundCriteria:
         away, needed = distinct_texts(away_m, WITHIN_REACH_M, 2)
         return Problem(
             f"the target is only {away} m away, but at least {needed} m is needed",
-            "if the vehicle hangs, take it down first; if not, move it farther from the target",
+            "if the vehicle is hanging, take it down first; if not, move it farther from the "
+            "target",
         )
 
     @staticmethod
@@ -369,7 +370,7 @@ class GroundCriteria:
         if moved_m <= WANDERED_M:
             return None
         return Problem(
-            f"{feed_name(profile)} shows a motion of {moved_m:.2f} m, but the vehicle stands still",
+            f"{feed_name(profile)} shows a motion of {moved_m:.2f} m, but the vehicle is at rest",
             "keep the target still, put down the body being carried, or correct positioning.body",
         )
 
@@ -406,7 +407,7 @@ class GroundCriteria:
         if away_m <= fence_m + target.expected_within_m:
             return None
         return Problem(
-            f"the target is expected {away_m:.1f} m from where the vehicle stands (x "
+            f"the target is expected {away_m:.1f} m from the vehicle (x "
             f"{x:.2f}, y {y:.2f} m), but the fence is {fence_m:g} m",
             "correct target.expected_xy_m, or positioning.body if it names another vehicle's body",
         )

@@ -155,8 +155,8 @@ def still_waiting_for(turn: GroundTurn) -> str:
         waiting = _first(
             {
                 "a battery reading": criteria.battery_unknown,
-                "the vehicle to stand level": criteria.not_level,
-                "the vehicle to stand still": criteria.not_still,
+                "the vehicle to be level": criteria.not_level,
+                "the vehicle to be at rest": criteria.not_still,
                 "the supervisor to allow flight": criteria.supervisor_not_ready,
             }
         )

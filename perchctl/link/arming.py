@@ -74,7 +74,7 @@ def disarm(
 def warn_of_armed(vehicle: str) -> None:
     """Warn that the vehicle may still be armed."""
     warnings.warn(
-        f"{vehicle} may still be armed: keep away until its propellers stand still",
+        f"{vehicle} may still be armed: keep away until its propellers have stopped",
         Note,
         stacklevel=3,
     )

@@ -108,7 +108,7 @@ def settle_estimator(
             wait(RESET_PULSE_S * value)
         if _agree(feed, start, newest, clock, wait):
             return
-    where = "the origin, where the vehicle stands"
+    where = "the origin, the position of the vehicle"
     if not config.source.is_target:
         where = f"x {x:.2f}, y {y:.2f}, z {z:.2f} m, where {config.label} sees the vehicle"
     raise TimedOut(

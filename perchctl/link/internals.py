@@ -130,7 +130,9 @@ INTERNALS = (
     ),
     Internal("_thread", _radio_driver, "the thread that shows whether the driver is alive"),
     Internal(
-        "_radio", _radio_driver, "the driver's share of the dongle, read for the next two parts"
+        "_radio",
+        _radio_driver,
+        "the driver's share of the dongle, with `send_packet` and `_rsp_queue`",
     ),
     Internal(
         "send_packet", _dongle_share, "wrapped, so that the hub can count the dongle's answers"
@@ -142,7 +144,7 @@ INTERNALS = (
     Internal("rate_limit", _radio_thread, "set by the hub to poll an idle vehicle less often"),
     Internal("_radio", _dongle_thread, "None once the dongle is closed; it may never open again"),
     Internal("_radios", _radio_manager, "list from which a dongle's ended thread is removed"),
-    Internal("_lock", _radio_manager, "held while that thread is removed"),
+    Internal("_lock", _radio_manager, "held while an ended thread is removed from `_radios`"),
     Internal(
         "set_retries_before_disconnect",
         _radio_module,

@@ -298,7 +298,7 @@ class Sender:
                 try:
                     part()
                 except BaseException as error:  # any error; this thread continues
-                    failed = f"the link is not supervised: {error}"
+                    failed = f"link supervision failed: {error}"
             self._keeper_error = failed
 
     def _look_after_worker(self) -> None:

@@ -29,10 +29,10 @@ class RestState(Enum):
     """Where a vehicle with its motors off rests: on the magnet, on the floor, held elsewhere, or
     unknown. Each value is a phrase without a full stop."""
 
-    HANGS = "the vehicle hangs on the magnet with its motors off"
+    HANGS = "the vehicle is hanging on the magnet with its motors off"
     HELD = "something holds the vehicle away from the target; the motors are off"
-    STANDS = "the vehicle stands on the floor with its motors off"
-    UNKNOWN = "the motors are off; it is unknown whether the vehicle hangs or stands"
+    STANDS = "the vehicle is on the floor with its motors off"
+    UNKNOWN = "the motors are off; it is unknown whether the vehicle is hanging or on the floor"
     END_UNCONFIRMED = "the end of the flight could not be confirmed: keep away from the vehicle"
 
 

@@ -524,7 +524,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         PHASES_IN_WHICH_MAGNET_MAY_ATTACH,
         lambda c: c.true_for_s(HANGING) >= HELD_BY_OTHER_OBJECT_DWELL_S,
         lambda c: (
-            f"the vehicle hangs at the target's height, "
+            f"the vehicle is hanging at the target's height, "
             f"{gear_to_target_at_last_touch_or_now(c.belief).text}: the target's magnet may hold it"
         ),
         diagnosis=VehicleDiagnosis.HANGING_AT_LAST_TOUCH,
@@ -553,7 +553,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         "too-weak",
         CAMERA_GUIDED_PHASES,
         is_thrust_insufficient_for_press,
-        "hovering takes all the thrust: the vehicle is too heavy, the battery too low, or an "
+        "hovering needs all of the thrust: the vehicle is too heavy, the battery too low, or an "
         "obstacle is above",
     ),
 )

@@ -65,7 +65,8 @@ class CaptureComparison(BaseModel):
     def text(self, now: datetime) -> str:
         """Return the comparison's date in words."""
         assert self.at is not None
-        return f"compared by hand on {self.at.astimezone(now.tzinfo):%d %b %Y %H:%M}"
+        date = f"{self.at.astimezone(now.tzinfo):%d %b %Y %H:%M}"
+        return f"motion capture compared with the hand-held vehicle on {date}"
 
 
 def _set_up(config: PositioningConfig, vehicle: str) -> dict[str, Any]:

@@ -66,7 +66,7 @@ class SimulationConfig(Section):
         1.0, "maximum rotation error of the camera mount in the profile", ge=0, le=20
     )
     mount_error_m: float = key(
-        0.001, "maximum distance of the true mount from the one in the profile", ge=0, le=0.05
+        0.001, "maximum position error of the camera mount in the profile", ge=0, le=0.05
     )
     estimate_noise_m: ClassVar[float] = 0.002
     """Noise of the state estimate."""
@@ -81,7 +81,7 @@ class SimulationConfig(Section):
     draught_mps: Range = key((0.0, 0.3), "wind, with gusts")
     magnet_force_n: ClassVar[float] = 1.2  # holding force as a multiple of the weight
     first_contact_fails: float = key(
-        0.1, "share of flights in which the first contact does not hold", ge=0, le=1
+        0.1, "share of flights in which the magnet does not hold at the first contact", ge=0, le=1
     )
     no_target: bool = key(False, "simulate a bare ceiling")
     capture_delay_s: ClassVar[float] = 0.01
@@ -102,7 +102,7 @@ class SimulationConfig(Section):
     """Range of the magnet's holding force at a first contact that fails, as a share of the
     weight."""
     ceiling_suction: Shares = key(
-        (0.1, 0.1), "share of thrust gained when the rotors are at the ceiling"
+        (0.1, 0.1), "relative increase in thrust with the rotors at the ceiling"
     )
     cell_resistance_ohm: Ohms | None = key(
         (0.11, 0.23), "internal resistance of the battery; none: 0.143, a good cell"
@@ -113,7 +113,7 @@ class SimulationConfig(Section):
     )
     cell_charge: Charges = key((0.6, 1.0), "battery charge, as a fraction of a new cell's capacity")
     cell_knee: Knees = key(
-        (0.1, 0.1), "remaining share of charge below which the voltage drops steeply"
+        (0.1, 0.1), "remaining share of charge below which the voltage falls steeply"
     )
     motor_spread: float = key(
         0.07, "relative standard deviation of the motors' strengths", ge=0, le=0.2
@@ -129,7 +129,9 @@ class SimulationConfig(Section):
     airspeed_moment_nmspm: Range = key(
         (0.6e-3, 0.85e-3), "nose-up pitching moment in flight, in N.m per m/s of airspeed"
     )
-    ground_effect: Shares = key((0.1, 0.18), "share of thrust gained on the floor")
+    ground_effect: Shares = key(
+        (0.1, 0.18), "relative increase in thrust with the vehicle on the floor"
+    )
     thrust_noise: Shares = key(
         (0.011, 0.022),
         "relative fluctuation of each motor's thrust, with a correlation time of 20 ms",

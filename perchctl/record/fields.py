@@ -97,7 +97,7 @@ FIELDS: dict[str, str] = {
     },
     "lock_note": "why the frame's pose was rejected, or accepted at an unexpected position",
     "cam_age_s": "time since the last good frame",
-    "delay_s": "measured latency beyond the profile's camera.latency_s",
+    "delay_s": "measured latency minus the profile's camera.latency_s",
     "delay_used_s": "correction applied to the frames' times, with `camera.latency_s: measured`",
     # the estimate of the target at t_s, by which the planner steers: the paper's error vector
     **_axes("e{}_m", "position of the target relative to the gear, level frame"),
@@ -106,7 +106,8 @@ FIELDS: dict[str, str] = {
     **_axes("es{}_m", "standard deviation of the target's position"),
     "esyaw_rad": "standard deviation of eyaw_rad",
     "measured": "true if the newest frame showed the target, false while the filter coasts",
-    "tracked": "true while the filter runs, false for a remembered position",
+    "tracked": "true if the target is visible or the filter still predicts it, "
+    "false if its position is only remembered",
     "target_age_s": "time since the exposure of the last frame that showed the target",
     "unseen": "frames since the target was last detected",
     **_axes("t{}_m", "position of the target in the world frame of the state estimate"),
@@ -119,7 +120,7 @@ FIELDS: dict[str, str] = {
     "cmd_roll_rad": "roll sent with cmd_thrust, positive to the right",
     "cmd_pitch_rad": "pitch sent with cmd_thrust, positive nose down",
     "cmd_duration_s": "duration of a landing",
-    "late_s": "delay with which this tick started",
+    "late_s": "how late this tick started",
     # simulation only
     **_axes("true_{}_m", "true position of the body, simulation only"),
     "true_miss_m": "true horizontal distance of the gear from the target's centre, simulation only",

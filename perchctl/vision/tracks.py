@@ -183,7 +183,7 @@ MIN_ESTABLISHED_LOCK_FRAMES = 5
 
 _ESTIMATE_JUMPED_TEXT = "the state estimate jumped, but the target did not"
 _PREVIOUS_POSE_WRONG_TEXT = (
-    "the target is where it was expected before the last pose: that pose may have been wrong"
+    "the target is where it was expected before the previous pose, which may have been wrong"
 )
 # With four dimensions, 5 of 100 000 squared distances exceed it by chance.
 _MAX_ACCEPTED_INNOVATION_CHI2 = 25.0

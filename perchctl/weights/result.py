@@ -79,7 +79,7 @@ def fit_weights(path: Path, method: str, test: Path | None = None) -> FitResult:
     Errors: NotFound, InvalidValue.
     """
     if test is not None and same_file(path, test):
-        raise InvalidValue(f"the weights are fitted to {test}, so it cannot be used to test them")
+        raise InvalidValue(f"the weights were fitted to {test}, so it cannot be used to test them")
     errors = marker_errors(read_data(path))
     fits = fit_by_each_method(errors)
     other = None

@@ -113,7 +113,7 @@ FAULTS: list[tuple[str, Scripted, str, str]] = [
     ("body place", Scripted(y_up), "fail", "swapped axes: up is y"),
     ("body place", Scripted(lambda t_s, p: moved(p, position_m=(0.0, 0.0, 1.4))), "fail", "1.40"),
     ("body place", Scripted(lambda t_s, p: moved(p, position_m=(0.05 * t_s, 0.0, 0.02))), "fail",
-     "shows a motion of 0.15 m, but the vehicle stands"),
+     "shows a motion of 0.15 m, but the vehicle is at rest"),
 ]  # fmt: skip
 
 

@@ -79,7 +79,7 @@ def test_a_vehicle_that_nobody_has_seen_blink_at_its_home_fails(
     assert rows["vehicle"].verdict is Verdict.FAIL
     assert (
         rows["vehicle"].found
-        == "you did not confirm that the vehicle blinks at its home, 0.00 1.20 m"
+        == "you did not confirm that the vehicle is blinking at its home, 0.00 1.20 m"
     )
     assert rows["target"].verdict is Verdict.PASS
 
@@ -133,7 +133,7 @@ def test_a_lens_that_is_not_covered_proves_nothing(sim: SimProcess, relay: Relay
     stand = Stand(name="north", home_m=(0.0, 0.0), home_text="home", lookalikes=("east",))
     row = rows_of(relay.uri, sim, stand, lambda question: "blink" in question)["target"]
     assert row.verdict is Verdict.FAIL
-    assert "the camera of east would also see its target there" in row.found
+    assert "the camera of east would see its own target at the same position" in row.found
 
 
 def test_a_body_at_another_home_is_named(sim: SimProcess, relay: Relay) -> None:

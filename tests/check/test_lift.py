@@ -127,7 +127,7 @@ def test_a_capture_that_is_set_up_right_passes_and_may_be_flown_by(sim: SimProce
     (CaptureFault(axes=Y_UP), "crazyflie", "swapped axes: up is y"),
     (CaptureFault(axes=SWAPPED_XY), "crazyflie", r"are rotated by (8[5-9]|9.) deg"),
     (CaptureFault(scale=1000.0), "crazyflie", "the positions appear to be in millimetres"),
-    (None, "wand", "the vehicle moves while the rigid body 'wand' stands still"),
+    (None, "wand", "the vehicle moves while the rigid body 'wand' does not"),
 ])  # fmt: skip
 def test_what_is_set_up_wrong_is_named_and_not_flown_by(
     sim: SimProcess, fault: CaptureFault | None, body: str, words: str
@@ -141,5 +141,5 @@ def test_what_is_set_up_wrong_is_named_and_not_flown_by(
         sim.end_faults()
     assert rows[LIFTED].verdict is Verdict.FAIL, rows[LIFTED]
     assert re.search(words, rows[LIFTED].found)
-    with pytest.raises(SafetyAbort, match="compared by hand on"):
+    with pytest.raises(SafetyAbort, match="with the hand-held vehicle on"):
         it.may_fly()

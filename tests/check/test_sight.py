@@ -55,7 +55,7 @@ def test_under_the_target_it_passes() -> None:
      "at most 3.2 m above the camera", rehearsed(target_pictures=0, target=None)),
     ("fail", "the vehicle would not see it", "forward", rehearsed(1.3)),
     ("warn", "no longer in view at the end", "lost frames", rehearsed(target=None)),
-    ("fail", "shows a motion of 0.12 m, but the vehicle stands", "keep the target still",
+    ("fail", "shows a motion of 0.12 m, but the vehicle is at rest", "keep the target still",
      rehearsed(target_places=wandering(0.05))),
     ("pass", "in view now, and", "", rehearsed(target_places=wandering(0.01))),
     ("skipped", "no picture arrived", "", rehearsed(pictures=0)),

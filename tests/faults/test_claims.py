@@ -93,9 +93,9 @@ def test_what_a_rescue_says_counts_too(found: RestState) -> None:
         Event.make_rescue_note(9.0, ValueError(), found, "whatever it is called")
     )
     words = {
-        "stands on the floor": "stands", "hangs on the magnet": "hangs",
+        "is on the floor": "stands", "hanging on the magnet": "hangs",
         "something holds the vehicle": "held off the target",
-        "whether the vehicle hangs or stands": "hangs or stands",
+        "is hanging or on the floor": "hangs or stands",
         "could not be confirmed": "not seen down",
     }  # fmt: skip
     assert claims == {claim for word, claim in words.items() if word in found.value}

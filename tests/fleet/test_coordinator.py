@@ -270,7 +270,7 @@ def test_a_climb_is_permitted_again_and_again_until_a_neighbour_is_near() -> Non
     rig["v0"].tell(Stage.FLYING, phase=Phase.LANDING, place_m=strays, **known)
     rig.pass_s()
     assert [child.order.may_climb for child in rig.children.values()] == [True, False, True, True]
-    assert rig["v1"].order.why_not_climb == "v0 is too close to its climb path"
+    assert rig["v1"].order.why_not_climb == "v0 is too close to this vehicle's climb path"
     assert rig.words == [OperatorRequest.NONE] * 4, "it waits, but does not land"
     rig.end("v0", ABORTED)
     assert rig["v1"].order.may_climb

@@ -71,4 +71,4 @@ def test_without_a_terminal_nobody_can_see_it_blink(tmp_path: Path) -> None:
     path.write_text(ONE.replace("URI", uri), encoding="utf-8")
     done = run("fleet", "check", str(path), "--identify")
     assert (done.code, done.stdout) == (2, "")
-    assert done.complaint.startswith("--identify asks you whether north blinks")
+    assert done.complaint.startswith("--identify asks you whether north is blinking")

@@ -181,17 +181,25 @@ CROSSING = [((0.0, 0.0), (1.0, 0.0)), ((0.5, -1.0), (0.5, -1.5)), ((5.0, 0.0), (
     [
         (Script(), "perched", ""),
         (Script(outcome="landed"), "perched", ""),  # at its home, as planned
-        (Script(outcome="landed", lies_m=(0.6, 0.0)), "refused", "v0 lies 0.60 m from its home"),
+        (
+            Script(outcome="landed", lies_m=(0.6, 0.0)),
+            "refused",
+            "v0 is on the floor 0.60 m from its home",
+        ),
         (
             Script(outcome="landed", lies_m=(0.5, -0.5)),
             "refused",
-            "v0 lies 0.15 m from this vehicle's cor",
+            "v0 is on the floor 0.15 m from this vehicle's cor",
         ),
-        (Script(outcome="gone", lies_m=(math.nan, 0.0)), "refused", "it is unknown where v0 lies"),
+        (
+            Script(outcome="gone", lies_m=(math.nan, 0.0)),
+            "refused",
+            "the position of v0 is unknown",
+        ),
         (
             Script(outcome="landed", lies_m=(0.5, -1.2)),
             "refused",
-            "v0 lies 0.35 m inside this vehicle's",
+            "v0 is on the floor 0.35 m inside this vehicle's",
         ),
     ],
 )
@@ -214,7 +222,7 @@ def test_who_measures_in_the_room_s_axes_is_known_to_lie_where_it_does(stage: St
     away_m = math.dist(placed.true.to_room((0.0, 0.6)), planned.vehicles[0].home_m)
     assert f"{away_m:.2f}" != "0.60"
     result = fly(planned, are_exact=False)
-    assert f"v0 lies {away_m:.2f} m from its home" in result.vehicles[1].reason
+    assert f"v0 is on the floor {away_m:.2f} m from its home" in result.vehicles[1].reason
 
 
 def test_land_all_lands_who_flies_and_starts_nobody_else(stage: Stage) -> None:

@@ -180,7 +180,7 @@ def test_who_waits_in_another_s_corridor_flies_first() -> None:
 def test_who_would_hang_in_each_other_s_corridor_is_refused_with_both_names() -> None:
     assert refusal(fleet([((0, 0), (1, 0)), ((2, 0), (1.2, 0))])) == (
         "v0 and v1 cannot fly in any order: v1 hangs 0.15 m inside the corridor of v0, and v0 "
-        "hangs 0.15 m inside the corridor of v1; a vehicle that waits or hangs must be 0.24 m away "
+        "hangs 0.15 m inside the corridor of v1; a waiting or hanging vehicle must be 0.24 m away "
         "from another vehicle's corridor: move a home or target farther away"
     )
 

@@ -142,9 +142,7 @@ def tilted(sample: Telemetry) -> Telemetry:
 
 
 @pytest.mark.parametrize("lasts_s", [math.inf, 3.0], ids=["stays armed", "disarms itself"])
-@pytest.mark.parametrize(
-    ("change", "words"), [(tilted, "to stand level"), (shaken, "to stand still")]
-)
+@pytest.mark.parametrize(("change", "words"), [(tilted, "to be level"), (shaken, "to be at rest")])
 def test_a_vehicle_that_is_reached_for_once_armed_does_not_fly(
     change: Callable[[Telemetry], Telemetry], words: str, lasts_s: float
 ) -> None:

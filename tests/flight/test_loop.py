@@ -180,7 +180,7 @@ AT_ONCE: list[tuple[dict[str, Any], str]] = [
     ({"supervisor": READY | 1 << 13}, "unknown bits .0x200E"),
     ({"battery_v": 3.4}, r"3\.40 V.*3\.80 V.*charge"),
     ({"battery_v": 6.05}, r"voltage is 6\.05 V, but a single cell has at most 4\.40 V"),
-    ({"position_m": HANGS}, r"at 2\.10 m.*hangs.*take it down.*safety\.ground_z_m"),
+    ({"position_m": HANGS}, r"at 2\.10 m.*hanging.*take it down.*safety\.ground_z_m"),
     ({"position_m": (0.0, 0.0, -0.3)}, r"at -0\.30 m"),
 ]
 IN_TIME: list[tuple[dict[str, Any], str]] = [
@@ -193,8 +193,8 @@ IN_TIME: list[tuple[dict[str, Any], str]] = [
     ({"battery_v": math.nan}, r"no battery voltage: .*link\.unreported: \[battery\]"),
     ({"behind_s": math.nan}, "waited 10 s for telemetry"),
     ({"supervisor": 0x06}, "0x0006"),
-    ({"roll_rad": 0.3}, "stand level .tilted by 17 deg, but at most 10"),
-    ({"acc_z_g": 0.7}, r"stand still .*0\.70 g"),
+    ({"roll_rad": 0.3}, "be level .tilted by 17 deg, but at most 10"),
+    ({"acc_z_g": 0.7}, r"be at rest .*0\.70 g"),
 ]
 IN_TIME_LIKEWISE: list[tuple[dict[str, Any], str]] = [
     ({"velocity_variance_m2ps2": math.nan}, r"settle.*check the positioning system"),

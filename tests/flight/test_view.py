@@ -107,8 +107,8 @@ BESIDE = FeedStatus(problem="by the target the vehicle is 0.40 m from its estima
 @pytest.mark.parametrize(("seen", "words"), [
     ({}, f"view of the target.*{UNSEEN}"),
     # Who carries it, or has no camera, has no use for where the target is.
-    ({"telemetry": replace(REST, roll_rad=0.4)}, "stand level"),
-    ({"telemetry": replace(REST, acc_z_g=1.3)}, "stand still"),
+    ({"telemetry": replace(REST, roll_rad=0.4)}, "to be level"),
+    ({"telemetry": replace(REST, acc_z_g=1.3)}, "to be at rest"),
     ({"picture_problem": "none has arrived", "unseen_s": math.inf}, "a good picture"),
     ({"feed": BESIDE}, r"view of the target.*0\.40 m from its estimate"),
 ])  # fmt: skip

@@ -304,7 +304,7 @@ def test_a_guard_that_raises_is_a_trouble_until_it_works_again(library: Library)
             raise ZeroDivisionError("of the guard")
 
     sender = library.sender(guard=guard)
-    until(lambda: "not supervised: of the guard" in str(sender.trouble()))
+    until(lambda: "link supervision failed: of the guard" in str(sender.trouble()))
     works.set()
     until(lambda: sender.trouble() is None)
 

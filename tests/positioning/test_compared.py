@@ -204,5 +204,5 @@ def test_fly_refuses_before_it_asks_connects_or_logs(
     assert words in plan
     was_compared(CONFIG, URI, ago_s=3600.0)
     plan = fly(tmp_path, "--dry-run", "--json").stdout
-    assert "compared by hand on" in plan
+    assert "with the hand-held vehicle on" in plan
     assert "fly refuses" not in plan

@@ -114,7 +114,7 @@ def test_the_dialogue_asks_refuses_and_goes_on(tmp_path: Path) -> None:
         old.unlink()
     done = run(*words, stdin=f"{typed[2]}\n\n")
     assert done.exit_code == 0, done.output
-    assert "already holds 1 positions" in done.stderr
+    assert "already contains 1 positions" in done.stderr
     assert np.unique(read_data(path).position).tolist() == [1, 2]
 
 

@@ -574,10 +574,12 @@ SUPPORT_CONDITIONS = (
 class Support(Enum):
     """What supports the vehicle."""
 
-    AIR = "nothing: the vehicle flies"
-    PRESSED_SURFACE = "the target or an obstacle, against which the vehicle presses"
+    AIR = "nothing: the vehicle is flying"
+    PRESSED_SURFACE = "the target or an obstacle that the vehicle is pressing against"
     MAGNET = "the target's magnet"
-    HELD_BY_OTHER_OBJECT = "something away from the target, on which the vehicle hangs or stands"
+    HELD_BY_OTHER_OBJECT = (
+        "something away from the target that the vehicle is hanging from or standing on"
+    )
     FLOOR = "the floor"
     UNKNOWN = "unknown"
 

@@ -110,7 +110,7 @@ COMPLETE = PhaseDefinition(
             "fell-unseen",
             {Phase.COMPLETE},
             is_hang_monitoring_over,
-            "it is unknown whether the vehicle still hangs",
+            "it is unknown whether the vehicle is still hanging",
         ),
         land_row(
             "not-stopped",

@@ -125,8 +125,9 @@ LANDING = PhaseDefinition(
             lambda c: (
                 c.true_for_s(MOTORS_OFF_AS_COMMANDED) >= TARGET_RECHECK_DURATION_AFTER_MOTOR_STOP_S
             ),
-            "motors off; the telemetry was silent long enough to hide a fall, so it is unknown "
-            "whether the vehicle hangs or stands: look before you touch it",
+            "motors off; no telemetry arrived for so long that a fall may have gone unnoticed, so "
+            "it is unknown whether the vehicle is hanging or on the floor: look before you touch "
+            "it",
         ),
         abort_during_landing_row(
             "landing-timeout",

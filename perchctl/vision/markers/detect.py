@@ -303,7 +303,8 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         requirements_text="an expected, whole marker with straight sides and cells of at least "
         "2.5 px",
         cost_text="0.7 ms",
-        run_condition_text="the target is expected; after a loss, in three of four images",
+        run_condition_text="the target is expected; after the target was lost, in three of four "
+        "images",
         should_run=_is_target_expected,
         find=_fit_edges,
     ),
@@ -350,8 +351,8 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         requirements_text="a marker whose bits can be read",
         cost_text="4 to 9 ms, including the measurement of the markers found",
         run_condition_text="nothing was found, unless the target was cut off before and still is; "
-        "or an expected marker with sides above 13 px is missing; after a loss, in three of four "
-        "images",
+        "or an expected marker with sides above 13 px is missing; after the target was "
+        "lost, in three of four images",
         should_run=_should_search,
         find=_search,
     ),
@@ -359,7 +360,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         name="Blurred search",
         requirements_text="a whole marker with sides of at least 7 px that resembles its drawing",
         cost_text="5 to 10 ms",
-        run_condition_text="nothing was found; after a loss, in one of four images",
+        run_condition_text="nothing was found; after the target was lost, in one of four images",
         should_run=_can_target_be_blurred,
         find=_search_blurred,
     ),
