@@ -43,8 +43,8 @@ from perchctl.commands.simulate import (
     ClusterOption,
     JobsOption,
     SeedOption,
-    list_faults,
     make_executor,
+    print_faults,
     run_campaign,
     stop_handler,
 )
@@ -321,7 +321,8 @@ def simulate(
     to each other, and what went wrong according to the simulator's ground truth.
     """
     if faults == "list":
-        return list_faults(fleets.fleet_faults(), as_json)
+        say_on_terminal("listing the faults")
+        return print_faults(fleets.fleet_faults(), as_json)
     if resume and out is None:
         raise UsageError("--resume continues a results file: name it with --out")
     _say_reading(file)

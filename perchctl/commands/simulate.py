@@ -120,7 +120,8 @@ def run(
 ) -> int:
     """Simulate many seeded flights, faster than real time, and count the outcomes."""
     if faults == "list":
-        return list_faults(
+        say_on_terminal("listing the faults")
+        return print_faults(
             {fault.name: fault.description for fault in fault_campaigns.FAULTS}, as_json
         )
     if record and log_dir is None:
@@ -405,9 +406,8 @@ def log_error(results: Sequence[campaigns.CampaignFlight]) -> PerchError | None:
     return LogIncomplete(f"{len(problems)} of {len(results)} logs are incomplete: {problems[0]}")
 
 
-def list_faults(faults: Mapping[str, str], as_json: bool) -> int:
+def print_faults(faults: Mapping[str, str], as_json: bool) -> int:
     """Print the name and the description of each fault; returns the exit code."""
-    say_on_terminal("listing the faults")
     indent, columns = 2 + max(map(len, faults)), shutil.get_terminal_size().columns
     table = "\n".join(
         textwrap.fill(f"{name:<{indent}}{text}", columns, subsequent_indent=" " * indent)

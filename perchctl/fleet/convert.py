@@ -3,7 +3,8 @@
 Two formats are read: Crazyswarm2's ``crazyflies.yaml`` (IMRCLab/crazyswarm2, crazyflie/config), and
 the swarm files of Bitcraze's cfcli and Swarmkeeper (bitcraze/cfcli, docs/swarm.md). Neither format
 contains targets or cameras, and cfcli's format contains no positions. `missing` says what you have
-to add before perchctl accepts the file.
+to add to each vehicle before perchctl accepts the file; `missing_defaults` says what to add to the
+defaults before the fleet can fly.
 """
 
 from __future__ import annotations
