@@ -30,6 +30,7 @@ _BEGINNINGS = (
     (b"#ROSBAG V", ROS_BAG),
     (b"SQLite format 3\0", SQLITE),
     (b'{"kind":"header","format":"perchctl-flight-log"', "a flight log"),
+    (b'{"part":', "a recording from calibrate mount"),
 )
 _MCAP = b"\x89MCAP0\r\n"
 _MCAP_PROFILE = slice(21, 25)
@@ -42,6 +43,7 @@ _KEYS = (  # keys at the beginning of a line, by which a YAML file is recognised
     (r"vehicles", "a fleet file"),
     (r"extends|vehicle|planner|safety|positioning", "a profile"),
 )
+_JSON_BEGINNING = r'\s*(\{\s*("|\})|\[\s*["{\[\]\d-])'
 _READ_BYTES = 4096
 _UNKNOWN = "another kind of file"
 
@@ -71,6 +73,8 @@ def file_kind(path: Path) -> str:
         for keys, kind in _KEYS:
             if re.search(rf"^(?:{keys})\s*:", text, re.MULTILINE):
                 return kind
+        if re.match(_JSON_BEGINNING, text):
+            return "a JSON file"
     return _UNKNOWN
 
 

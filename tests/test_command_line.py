@@ -333,11 +333,23 @@ LOG = '{"kind":"header","format":"perchctl-flight-log","version":3}\n{}\n'
     ("line", "words"),
     [
         ("fly -p a.jsonl", "a.jsonl is not a profile (it is a flight log)"),
-        ("fly -p ./a.jsonl", "(it is a flight log)"),
+        ("fly -p ./a.jsonl", "a.jsonl is not a profile (it is a flight log)"),
+        ("fly -p b.jsonl", "b.jsonl is not a profile (it is a JSON file)"),
+        ("fly -p ./b.jsonl", "b.jsonl is not a profile (it is a JSON file)"),
+        ("fleet check a.jsonl", "a.jsonl is not a fleet file (it is a flight log)"),
+        (
+            "calibrate mount -p sim --from a.jsonl",
+            "a.jsonl is not a recording from calibrate mount (it is a flight log)",
+        ),
+        ("calibrate mount -p sim --from b.jsonl", "b.jsonl, line 1 is not a line of"),
+        ("log show m.jsonl", "(it is a recording from calibrate mount)"),
         (f"profile -p {ROOT}/fleets/four.yaml", "is a fleet file, not a profile"),
         (f"fly -p {CALIBRATION}", "is a camera calibration, not a profile"),
         (f"fleet check {ROOT}/profiles/sim.yaml", "(it is a profile)"),
-        ("make-target design a.jsonl", "(it is a flight log)"),
+        (
+            "make-target design a.jsonl",
+            "a.jsonl is not a camera calibration (it is a flight log)",
+        ),
         ("track a.jsonl", "neither a picture nor a video (it is a flight log)"),
         ("fit-weights a.jsonl", "(it is a flight log)"),
         (f"log show {ROOT}/profiles/sim.yaml", "(it is a profile)"),
@@ -345,9 +357,12 @@ LOG = '{"kind":"header","format":"perchctl-flight-log","version":3}\n{}\n'
 )
 def test_a_file_of_another_kind_is_named(line: str, words: str) -> None:
     Path("a.jsonl").write_text(LOG)
+    Path("b.jsonl").write_text('{"a": 1}\n{"b": 2}\n')
+    Path("m.jsonl").write_text('{"part":"carry","mirrored_pictures":0}\n')
     said = run(*line.split())
     assert said.code == InvalidValue.exit_code
     assert words in said.complaint
+    assert "not YAML" not in said.complaint
 
 
 def test_swapped_arguments_are_put_right() -> None:

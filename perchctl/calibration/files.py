@@ -64,8 +64,15 @@ def _parsed(path: Path) -> tuple[CameraModel, dict[str, Any]]:
         lens, values = parse_calibration(text)
         return _checked(lens), values
     except InvalidValue as error:
-        note = kind_note(path, "a camera calibration")
-        raise InvalidValue(f"{path}: {error}{note}") from None
+        # In a file that may be a calibration, the faulty key is what the user needs; in any other
+        # file, its kind is.
+        if note := kind_note(path, "a camera calibration", "a JSON file"):
+            raise InvalidValue(f"{path} is not a camera calibration{note}") from None
+        raise InvalidValue(f"{path}: {error}") from None
+
+
+_MAY_BE_LATIN_1 = ("another kind of file", "a camera calibration", "a profile", "a JSON file")
+"""Kinds of file, as named by `file_kind`, that an editor may have written in Latin-1."""
 
 
 def _text(path: Path) -> str:
@@ -83,7 +90,7 @@ def _text(path: Path) -> str:
         if b"\0" not in data:
             return data.decode("utf-8-sig")
     except UnicodeDecodeError:
-        if file_kind(path) in ("another kind of file", "a camera calibration", "a profile"):
+        if file_kind(path) in _MAY_BE_LATIN_1:
             # Latin-1, with the quotation marks of Windows
             return data.decode("cp1252", errors="replace")
     raise InvalidValue(

@@ -94,7 +94,7 @@ def convert_fleet(path: Path) -> ConvertedFleet:
 
     Errors: NotFound, InvalidValue.
     """
-    values = read_yaml(path)
+    values = read_yaml(path, "a fleet file")
     robots, units = values.get("robots"), values.get("units")
     if isinstance(robots, dict):
         found = _from_crazyswarm2(path, robots, values.get("robot_types"))

@@ -104,7 +104,7 @@ def load_fleet(name: str | Path = EXAMPLE_FLEET) -> Fleet:
     Errors: NotFound, InvalidValue.
     """
     path = find_fleet(str(name))
-    values = read_yaml(path)
+    values = read_yaml(path, "a fleet file")
     if "vehicles" not in values:
         raise InvalidValue(
             f"{path}: has no vehicles, so it is not a fleet file: list them under vehicles, each "

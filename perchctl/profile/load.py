@@ -150,7 +150,7 @@ def _read_weights(name: str) -> WeightsConfig:
             f"merge.weights_file: {name} does not exist; make it with perchctl fit-weights, "
             "or remove the key"
         )
-    weights = read_yaml(path).get("weights")
+    weights = read_yaml(path, "a weights file").get("weights")
     held = weights if isinstance(weights, dict) else {}
     missing = [axis for axis in WeightsConfig.model_fields if axis not in held]
     if missing:
@@ -280,23 +280,28 @@ def _place_beside(
         values[section] = {**part, key: str(beside)}  # type: ignore[dict-item]
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Return the keys and values of a YAML file, unchecked. Errors: NotFound, InvalidValue."""
+def read_yaml(path: Path, expected: str = "a profile") -> dict[str, Any]:
+    """Return the keys and values of a YAML file, unchecked. `expected`: what messages say that the
+    file should be. Errors: NotFound, InvalidValue."""
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
-        raise InvalidValue(f"{path}: not a text file in UTF-8{kind_note(path)}") from None
+        if note := kind_note(path):
+            raise InvalidValue(f"{path} is not {expected}{note}") from None
+        raise InvalidValue(f"{path}: not a text file in UTF-8") from None
     except OSError as error:
         raise NotFound(f"{path}: cannot be read: {error.strerror}") from None
-    return _values_of(text, path)
+    return _values_of(text, path, expected)
 
 
-def _values_of(text: str, path: Path) -> dict[str, Any]:
+def _values_of(text: str, path: Path, expected: str = "a profile") -> dict[str, Any]:
     try:
         values = parse_yaml(text)
     except ValueError as error:
-        note = kind_note(path, "a profile", "a fleet file", "a camera calibration")
-        raise InvalidValue(f"{path}: {error}{note}") from None
+        # In a YAML file, the faulty line is what the user needs; in any other file, its kind is.
+        if note := kind_note(path, "a profile", "a fleet file", "a camera calibration"):
+            raise InvalidValue(f"{path} is not {expected}{note}") from None
+        raise InvalidValue(f"{path}: {error}") from None
     if values is None:
         return {}
     if not isinstance(values, dict):

@@ -17,7 +17,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.files import write_files
+from perchctl.files import kind_note, write_files
 from perchctl.geometry import Array
 
 MountingPart = Literal["carry", "pivot"]
@@ -118,8 +118,13 @@ class MountingRecording:
                     roll, pitch, yaw = _numbers(record, "rpy_rad", 3).tolist()
                     parts[-1].attitudes.append(AttitudeSample(t_s, roll, pitch, yaw, gyro_radps))
             except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
+                if note := kind_note(path, "a recording from calibrate mount", "a JSON file"):
+                    raise InvalidValue(
+                        f"{path} is not a recording from calibrate mount{note}"
+                    ) from None
+                why = f"{error.args[0]} is missing" if isinstance(error, KeyError) else error
                 raise InvalidValue(
-                    f"{path}, line {number} is not a line of a calibrate mount recording: {error}"
+                    f"{path}, line {number} is not a line of a calibrate mount recording: {why}"
                 ) from None
         if not parts:
             raise InvalidValue(f"{path} is empty: name a recording from calibrate mount")
