@@ -43,8 +43,9 @@ class TargetDesign:
             the marker's sides parallel to the sides of the image.
         small_nearest_m: nearest range from the gear's tip to the target at which the small marker
             is whole in any rotation, with the gear directly under the target's centre.
-        start_range_m: from the camera to the target at the start of the search, at the height
-            `start_height_m` (0: on the ground); None if the ceiling's height is unknown.
+        start_range_m: from the camera to the target at the height `start_height_m`, from which the
+            target must be found: the highest point of the search or, if the target is the position
+            source, the ground (0). None if the ceiling's height is unknown.
         standoff_m: distance from the gear to the target before contact.
     """
 
@@ -78,13 +79,18 @@ class TargetDesign:
             far_m = focal_px(self.camera) * self.target.large.side_m / sure_px
         if start_m is not None and start_m < 0.3 and self.start_height_m > 0.0:
             found.append(
-                f"where the search begins ({self.start_height_m:g} m above the floor) the "
-                "target is less than 0.3 m above the camera: lower planner.search.max_height_m"
+                f"at the highest point of the search ({self.start_height_m:g} m above the floor), "
+                "the target is less than 0.3 m above the camera: lower planner.search.max_height_m"
             )
         if start_m is not None and start_m > far_m:
+            gap, place = "gap above the search", "even from its highest point"
+            if self.start_height_m == 0.0:
+                gap, place = "gap at the start", "from the ground"
+            else:
+                place += f", {self.start_height_m:g} m above the floor"
             found.append(
-                f"gap at the start: from {self.start_height_m:g} m above the floor the target "
-                f"is {start_m:.2f} m from the camera, but it is found only within {far_m:.2f} m"
+                f"{gap}: {place}, the target is {start_m:.2f} m from the camera, but it is found "
+                f"only within {far_m:.2f} m"
             )
         if self.z2_m <= self.z3_m:
             found.append(
@@ -128,10 +134,10 @@ class TargetDesign:
             "mounting": self.blind_range.text,
         }
         if self.start_range_m is not None:
-            rows["search"] = (
-                f"{_cm(self.start_range_m):<9} to the target from {self.start_height_m:g} m "
-                "above the floor, where the search begins"
-            )
+            name, place = "search", f"{self.start_height_m:g} m above the floor, its highest point"
+            if self.start_height_m == 0.0:
+                name, place = "start", "the ground, where the target must be in view"
+            rows[name] = f"{_cm(self.start_range_m):<9} to the target from {place}"
         lines = [f"{name:<10}{text}" for name, text in rows.items()]
         warnings = [f"warning: {text}" for text in self.warnings]
         return "\n".join([*lines, "", *(warnings or ["no gap between search and stand-off"])])

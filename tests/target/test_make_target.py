@@ -253,7 +253,14 @@ def test_a_design_writes_nothing() -> None:
     out, _ = call("design", CAMERA, "--ceiling", "2.4", "--blur", "2.0")
     assert "z1" in out
     assert "mounting  never blind" in out
+    assert "from 1.3 m above the floor, its highest point" in out
     assert files() == set()
+
+
+@pytest.mark.long
+def test_a_target_that_is_the_position_source_is_designed_from_the_ground() -> None:
+    out, _ = call("design", CAMERA, "-p", "target_only", "--ceiling", "2.0")
+    assert "200 cm    to the target from the ground" in out
 
 
 REFUSALS = [

@@ -224,7 +224,7 @@ def test_z3_is_the_geometry_s() -> None:
     ("changes", "said"),
     [
         ({}, ""),
-        ({"z1_m": 0.9}, "gap at the start"),
+        ({"z1_m": 0.9}, "gap above the search: even from its highest point, 1.3 m above"),
         ({"start_range_m": 0.2}, "less than 0.3 m above the camera"),
         ({"z2_m": 0.15}, "gap between the markers"),
         ({"z1_m": None}, "never be read"),
