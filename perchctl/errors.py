@@ -93,12 +93,12 @@ def no_cluster(why: str = "it is missing") -> UsageError:
 
 class ConnectionFailed(PerchError):
     exit_code = 10
-    meaning = "no connection to the vehicle, camera, motion capture or cluster"
+    meaning = "no connection to the vehicle, motion capture or cluster, or camera lost"
 
 
 class NotFound(PerchError):
     exit_code = 20
-    meaning = "file, profile, camera or firmware variable not found"
+    meaning = "file, profile, firmware variable or camera not found, or camera refuses"
 
 
 class InvalidValue(PerchError):
@@ -108,7 +108,7 @@ class InvalidValue(PerchError):
 
 class TimedOut(PerchError):
     exit_code = 40
-    meaning = "timeout before the flight"
+    meaning = "timeout before the flight, such as no image from the camera in time"
 
 
 class TargetNotFound(PerchError):

@@ -17,7 +17,7 @@ from perchctl.camera import open_camera
 from perchctl.camera.jpeg import MOST_STREAM_PX
 from perchctl.camera.network import DELAY_WINDOW_S, RtspSource, TransferDelay
 from perchctl.camera.source import LiveSource
-from perchctl.errors import NotFound
+from perchctl.errors import EXIT_CODES, NotFound
 from tests.helpers.live import WAIT_S, Clock, begun, level, next_frame
 from tests.helpers.rtsp import RtspServer, Step
 from tests.helpers.waiting import until
@@ -140,6 +140,7 @@ def test_nobody_listens(server: RtspServer, host: str, words: str) -> None:
     with pytest.raises(NotFound, match=words) as caught:
         open_camera(url.replace("127.0.0.1", host or "127.0.0.1"), Clock(), timeout_s=WAIT_S)
     assert "secret" not in str(caught.value)
+    assert "camera refuses" in EXIT_CODES[caught.value.exit_code]
 
 
 def test_a_stream_without_a_picture_says_so(server: RtspServer, opened: list[LiveSource]) -> None:
@@ -150,6 +151,7 @@ def test_a_stream_without_a_picture_says_so(server: RtspServer, opened: list[Liv
     source = begun(RtspSource(server.url(), 0.0, Clock()), opened, **times_s)
     until(lambda: "first frame within 1 s: connected, but" in str(source.no_first_frame(1.0)))
     assert "close other programs that use it" in str(source.no_first_frame(1.0))
+    assert "no image from the camera" in EXIT_CODES[source.no_first_frame(1.0).exit_code]
     never.set()
 
 
