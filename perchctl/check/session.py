@@ -203,12 +203,14 @@ class VehicleChecks:
             return skipped("the vehicle gets its position from the target, and only in flight")
         if mocap is None:
             self.scope.announce(f"now, within {within_s:g} s: {vehicle.HOW_TO_LIFT}")
-            return vehicle.lift_finding(vehicle.record_lift(self.probe, time.sleep, within_s))
+            wait = vehicle.counting_down(within_s, self.scope.announce, time.monotonic, time.sleep)
+            return vehicle.lift_finding(vehicle.record_lift(self.probe, wait, within_s))
         if isinstance(mocap, PerchError):
             return skipped(f"no {config.label}")
         self.scope.announce(f"now, within {within_s:g} s: {capture.HOW_TO_TURN}")
         take = self.probe.telemetry
-        seen = capture.collect_samples(take, mocap, time.monotonic, time.sleep, within_s)
+        wait = vehicle.counting_down(within_s, self.scope.announce, time.monotonic, time.sleep)
+        seen = capture.collect_samples(take, mocap, time.monotonic, wait, within_s)
         return capture.comparison_finding(
             capture.pair_motion(seen.telemetry, seen.body_poses(config)), config
         )

@@ -355,6 +355,8 @@ VEHICLE: dict[str, Callable[[VehicleStatus, Profile], Finding]] = {
 
 LIFTED = "lifted"
 LIFT_S = 20.0
+COUNTDOWN_STEP_S = 5.0
+"""Time between two announcements of the time that is left, s."""
 HOW_TO_LIFT = "lift the vehicle by 30 cm, hold it level, and put it back"
 LIFT_CHECK_M = 0.15
 """Rise of the estimate above which a lift is evaluated, m. Larger: a short lift is skipped."""
@@ -367,6 +369,27 @@ drift passes."""
 MOVED_G = 0.05
 """Deviation of the accelerometer from 1 g that shows a lift by hand; the noise at rest is a tenth
 of this."""
+
+
+def counting_down(
+    duration_s: float,
+    announce: Callable[[str], None],
+    clock: Callable[[], float],
+    wait: Wait,
+) -> Wait:
+    """Return `wait`, extended to announce every `COUNTDOWN_STEP_S` how much is left of
+    `duration_s`."""
+    began_s = clock()
+    next_left_s = duration_s - COUNTDOWN_STEP_S
+
+    def wait_and_count(seconds: float) -> None:
+        nonlocal next_left_s
+        wait(seconds)
+        if next_left_s > 0.0 and began_s + duration_s - clock() <= next_left_s:
+            announce(f"{next_left_s:g} s left")
+            next_left_s -= COUNTDOWN_STEP_S
+
+    return wait_and_count
 
 
 def record_lift(link: ProbeLink, wait: Wait, duration_s: float = LIFT_S) -> list[Telemetry]:

@@ -293,3 +293,13 @@ def test_a_lift_makes_its_row(
     assert finding.verdict == verdict, finding
     assert words in finding.found
     assert sum(waits) == pytest.approx(3.0)
+
+
+def test_the_time_for_a_lift_is_counted_down() -> None:
+    waits: list[float] = []
+    announced: list[str] = []
+    wait = vehicle.counting_down(12.0, announced.append, lambda: sum(waits), waits.append)
+    for _ in range(130):  # longer than announced: nothing is said after the end
+        wait(0.1)
+    assert announced == ["7 s left", "2 s left"]
+    assert sum(waits) == pytest.approx(13.0)
