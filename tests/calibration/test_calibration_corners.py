@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from perchctl.calibration import find_views, learn_gear_mask
+from perchctl.calibration.board import detect
 from perchctl.calibration.board.detect import BoardView, find_board, fit_saddles
 from perchctl.camera import Grey
 from perchctl.errors import InvalidValue
@@ -54,6 +55,17 @@ def test_a_corner_is_found_without_bias(square_px: float, slant_deg: float) -> N
         assert fit.is_valid.all()
         errors.append(fit.corners_px[0] - at)
     assert np.abs(errors).max() < (0.12 if square_px < 10 else 0.03)
+
+
+def test_markers_without_corners_are_refused_with_advice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a picture of a board that is far away."""
+    seen = np.arange(2), np.array([[50.0, 60.0], [58.0, 60.0]]), 30
+    monkeypatch.setattr(detect, "charuco_corners", lambda image, board: seen)
+    reason = find_board(np.full((480, 640), 120, np.uint8), CHARUCO)
+    assert isinstance(reason, str)
+    assert reason.startswith("found 30 markers, but only 2 corners of the board")
+    assert "too small in the image" in reason
+    assert reason.endswith("move it closer")
 
 
 def test_a_flat_patch_is_refused() -> None:

@@ -204,7 +204,10 @@ def _charuco(image: Grey, board: Board) -> _Corners | str:
         return _without_board(image)
     plane = np.column_stack([_cells(board, numbers), np.ones(len(numbers))])
     if len(numbers) < MIN_CORNERS or np.linalg.matrix_rank(plane) < 3:
-        return f"found {markers} markers, but too few corners of the board"
+        return (
+            f"found {markers} markers, but only {len(numbers)} corners of the board, which may be "
+            "too small in the image or partly hidden; move it closer"
+        )
     return numbers, corners, board.legacy
 
 
