@@ -64,7 +64,10 @@ def test_a_report_is_of_the_newest(logs: Path) -> None:
 def test_a_plot_s_name_is_its_form(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Path] = []
     monkeypatch.setattr("perchctl.analysis.plot_flight", lambda _log, path: drawn.append(path))
+    told: list[str] = []
+    monkeypatch.setattr("perchctl.commands.log.say_on_terminal", told.append)
     assert run("log", "plot", OLD).stdout == "plot:      perchctl-logs/flight_old.png\n"
+    assert told == [f"reading {OLD}", "drawing perchctl-logs/flight_old.png"]
     assert run("log", "plot", OLD, "-o", "x.PDF").stdout == "plot:      x.PDF\n"
     assert drawn == [Path("perchctl-logs/flight_old.png"), Path("x.PDF")]
     Path("perchctl-logs/flight_old.png").touch()  # as `fly` leaves it

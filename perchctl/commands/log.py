@@ -128,6 +128,7 @@ def plot(
             print(f"plot:      {beside}")
             return
         picture = _place(path, output, PLOTS, force)
+    say_on_terminal(f"drawing {picture}")
     analysis.plot_flight(log, picture)
     print(f"plot:      {picture}")
 

@@ -135,9 +135,9 @@ def design(
     say_on_terminal(f"reading profile {profile}")
     config = profiles.load_profile(profile)
     path = profiles.find_calibration(camera or config.camera.calibration)
-    found = targets.make_design(
-        config.target, calibrations.load_calibration(path), blur, config, ceiling
-    )
+    model = calibrations.load_calibration(path)
+    say_on_terminal(f"finding the smallest markers that are readable at a blur of {blur:g} px")
+    found = targets.make_design(config.target, model, blur, config, ceiling)
     record = found.record() | {"target": config.target.model_dump(mode="json")}
     print_result(record if as_json else found.text(str(path)))
 

@@ -248,6 +248,18 @@ def test_the_plain_call_writes_the_pdf_alone_and_twice_the_same() -> None:
     assert Path("target.pdf").read_bytes() == first
 
 
+def test_a_design_says_what_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    monkeypatch.setattr("perchctl.commands.make_target.say_on_terminal", told.append)
+
+    def stop(*_: object) -> None:
+        raise InvalidValue("here it takes long")
+
+    monkeypatch.setattr("perchctl.target.make_design", stop)
+    call("design", "--blur", "2.0", code=InvalidValue.exit_code)
+    assert told[1:] == ["finding the smallest markers that are readable at a blur of 2 px"]
+
+
 @pytest.mark.long
 def test_a_design_writes_nothing() -> None:
     out, _ = call("design", CAMERA, "--ceiling", "2.4", "--blur", "2.0")
