@@ -83,6 +83,7 @@ EXAMPLE_CALIBRATION = "example_640x480.yaml"
 SIMULATED = "sim://"
 QUESTIONS: dict[str, str] = {
     "link.uri": "radio://0/80/2M/E7E7E7E7E7",
+    "positioning.by": "deck",
     "camera.source": "camera:0",
     "camera.calibration": EXAMPLE_CALIBRATION,
     "camera.latency_s": "0.08",
@@ -99,14 +100,16 @@ QUESTIONS: dict[str, str] = {
 ceiling. Some defaults depend on earlier answers (`default_answer`)."""
 WORDS: dict[str, str] = {
     "link.uri": "The vehicle's URI: radio://0/80/2M/E7E7E7E7E7, usb://0, sim://",
+    "positioning.by": "The source of the vehicle's position: deck (Flow, Lighthouse or Loco), "
+    "mocap (motion capture), or target (the printed target alone)",
     "camera.source": "The camera: camera:N (a receiver at /dev/videoN), http://..., rtsp://..., "
     "aideck://HOST",
     "camera.calibration": "The camera's calibration file, from perchctl calibrate",
-    "camera.latency_s": "Latency of the image, from exposure to arrival (often 60 to 100 ms),\n"
-    "or the word measured, to have each flight measure it",
-    "front": "Move a hand over the front of the vehicle. At which edge of the image does it\n"
+    "camera.latency_s": "Latency of the image, from exposure to arrival (often 60 to 100 ms), "
+    "or measured, to have each flight measure it",
+    "front": "Move a hand over the front of the vehicle. At which edge of the image does it "
     "appear: top, right, bottom or left?",
-    "left": "Move a hand over the left side of the vehicle. At which edge of the image does\n"
+    "left": "Move a hand over the left side of the vehicle. At which edge of the image does "
     "it appear? (In a mirrored image, it appears at the opposite edge.)",
     "camera.mount.position_m": "Position of the lens, from the vehicle's centre: forward, left, up",
     "vehicle.gear_body_m": "Position of the magnet gear's tip: forward, left, up",
@@ -211,6 +214,11 @@ def new(
             "questions again"
         )
     _say_doubts(profiles.load_profile(str(output.absolute())))
+    if profile.positioning.source.is_mocap and not profile.positioning.host:
+        say(
+            "positioning: add system, host and body of your motion capture to the section "
+            f"positioning in {output}; docs/positioning.md shows them"
+        )
     print(f"wrote {output}\ncheck the plan: perchctl fly -p {shown} --dry-run")
 
 
@@ -233,6 +241,8 @@ def default_answer(name: str, answers: Answers) -> str:
     made = sorted(Path("calib").glob("camera_*.yaml"), key=lambda path: path.stat().st_mtime)
     if name == "camera.calibration" and made and not source.startswith("sim:"):
         return str(made[-1])
+    if name == "camera.latency_s" and answers.get("positioning.by") == "target":
+        return "measured"  # the position loop depends on it
     if name == "left":
         return left_edges(answers["front"])[0]
     if name == "target.small.side_m":
@@ -317,6 +327,11 @@ def _read(name: str, typed: str) -> str:
         raise InvalidValue(f"found {typed!r}; enter numbers in {unit}") from None
     if size < 1.0 and any(numbers) and all(abs(number) < 1.0 for number in numbers):
         raise InvalidValue(f"found {typed!r}, which is too small: enter numbers in {unit}")
+    if size < 1.0:
+        low, high = (bound / size for bound in profiles.key_bounds(name))
+        if not all(low <= number <= high for number in numbers):
+            more = ", or the word measured" if name == "camera.latency_s" else ""
+            raise InvalidValue(f"found {typed!r}; allowed are {low:g} to {high:g} {unit}{more}")
     values = [f"{number * size:.12g}" for number in numbers]
     return values[0] if len(values) == 1 else f"[{', '.join(values)}]"
 

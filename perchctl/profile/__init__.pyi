@@ -5,6 +5,7 @@ from .edit import profile_value as profile_value
 from .edit import writable_profile as writable_profile
 from .edit import write_profile_values as write_profile_values
 from .keys import json_schema as json_schema
+from .keys import key_bounds as key_bounds
 from .keys import profile_text as profile_text
 from .keys import yaml_scalar as yaml_scalar
 from .limits import DOUBTFUL as DOUBTFUL

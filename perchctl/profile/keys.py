@@ -5,6 +5,7 @@ The table in docs/profiles.md, commented YAML files and the schema for editors a
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -46,6 +47,23 @@ def keys(section: BaseModel, prefix: str = "") -> Iterator[Key]:
             schema, path = properties[name], f"{prefix}{name}"
             meaning = str(schema.get("description", ""))
             yield Key(path, key_unit(path), meaning, _allowed(schema), value)
+
+
+def key_bounds(path: str) -> tuple[float, float]:
+    """Return the smallest and the largest allowed value of a key, or of each number in its list;
+    infinite where the key has no bound."""
+    section: BaseModel = Profile()
+    *sections, name = path.split(".")
+    for each in sections:
+        section = getattr(section, each)
+    schema = _properties(type(section))[name]
+    for kind in schema.get("anyOf", [schema]):
+        number = kind.get("prefixItems", [kind])[0]
+        if number.get("type") in ("number", "integer"):
+            low = number.get("minimum", number.get("exclusiveMinimum", -math.inf))
+            high = number.get("maximum", number.get("exclusiveMaximum", math.inf))
+            return float(low), float(high)
+    return -math.inf, math.inf
 
 
 @cache

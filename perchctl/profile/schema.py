@@ -130,7 +130,10 @@ class Profile(Section):
                     raise InvalidValue(f"{dotted}: {name} is {what}")
                 inner = inner[name]
             if isinstance(inner.get(key), dict) and dotted != "link.parameters":
-                raise InvalidValue(f"{dotted} is a section: set its keys one by one")
+                first = next(iter(inner[key]))
+                raise InvalidValue(
+                    f"{dotted} is a section: set its keys one by one, such as {dotted}.{first}"
+                )
             inner[key] = value
         try:
             _, notes, lost = split_constant_keys(values, Profile)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import tempfile
@@ -57,6 +58,7 @@ def answers(draw: st.DrawFn) -> dict[str, str]:
     return {
         "link.uri": "sim://" if simulated else draw(st.sampled_from(["usb://0", "udp://a.b:1"])),
         "camera.source": draw(st.sampled_from(["camera:3", "http://h:80/a#b?c=d, e"])),
+        "positioning.by": draw(st.sampled_from(["deck", "mocap", "target"])),
         "camera.calibration": "example_640x480",
         "camera.latency_s": str(draw(st.decimals("0.001", "0.39", places=5))),
         "front": front,
@@ -92,6 +94,8 @@ def test_the_file_loads_and_equals_what_was_answered(said: dict[str, str]) -> No
     assert mine.planner.search.max_height_m <= ceiling_m - 0.49
     found, default = ({key.path: key.default for key in keys(p)} for p in (mine, type(mine)()))
     other = default.keys() - profile_and_keys(said, "mine")[1] - {"name"}
+    # With the target as the position source, positions have other defaults.
+    other -= {path for path in other if path.startswith("positioning.")}
     assert {path: found[path] for path in other} == {path: default[path] for path in other}
 
 
@@ -111,6 +115,47 @@ def test_no_question_is_broken_inside_a_word(
     assert new(tmp_path / "mine.yaml").exit_code == 0
     assert len(asked) == len(QUESTIONS) + 1
     assert max(len(line) for text in asked for line in text.splitlines()) <= 80
+
+
+def test_a_question_fills_its_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr("perchctl.commands.profile.ask", lambda text: asked.append(text) or "")
+    assert new(tmp_path / "mine.yaml").exit_code == 0
+    for text in asked[:-1]:
+        *question, _default = text.splitlines()
+        for line, below in itertools.pairwise(question):
+            assert len(f"{line} {below.split()[0]}") > 80, text
+
+
+@pytest.mark.parametrize(("typed", "allowed"), [
+    ("2000", "found '2000'; allowed are 0 to 1000 ms, or the word measured"),
+    ("-5 ms", "found '-5 ms'; allowed are 0 to 1000 ms"),
+])  # fmt: skip
+def test_a_latency_out_of_range_is_refused_in_the_unit_of_the_answer(
+    typed: str, allowed: str, tmp_path: Path
+) -> None:
+    done = new(tmp_path / "mine.yaml", typed="\n" * 4 + f"{typed}\n" + "\n" * 10)
+    assert done.exit_code == 0
+    assert allowed in " ".join(done.stderr.split())
+
+
+@pytest.mark.parametrize(("by", "latency_s", "told"), [
+    ("deck", 0.08, ""), ("mocap", 0.08, "add system, host and body"), ("target", "measured", ""),
+])  # fmt: skip
+def test_the_position_source_is_asked_for(
+    by: str, latency_s: float | str, told: str, tmp_path: Path
+) -> None:
+    done = new(tmp_path / "mine.yaml", typed="\n" + f"{by}\n" + "\n" * 12)
+    assert done.exit_code == 0, done.stderr
+    mine = load_profile(str(tmp_path / "mine.yaml"))
+    assert (mine.positioning.by, mine.camera.latency_s) == (by, latency_s)
+    assert (told or "wrote") in done.stderr + done.stdout
+
+
+def test_a_section_is_refused_with_one_of_its_keys(tmp_path: Path) -> None:
+    refused = new(tmp_path / "m.yaml", "--set", "positioning=deck")
+    assert refused.exit_code == 30
+    assert "set its keys one by one, such as positioning.by" in refused.stderr
 
 
 @pytest.mark.parametrize(("confirmed", "code"), [
@@ -149,6 +194,7 @@ def test_a_password_is_in_the_source_alone(tmp_path: Path) -> None:
 
 WRONG: dict[str, tuple[str, str]] = {
     "link.uri": ("bogus", "radio://0/80/2M"),
+    "positioning.by": ("flow", "'deck', 'mocap' or 'target'"),
     "camera.source": ("webcam:0", "camera:N"),
     "camera.calibration": ("none.yaml", "give a path"),
     "camera.latency_s": ("80", "allowed are 0 to 1"),
@@ -166,7 +212,7 @@ WRONG: dict[str, tuple[str, str]] = {
 MISTYPED = WRONG | {
     "camera.latency_s": ("0.08", "too small: enter numbers in ms"),
     "camera.mount.position_m": ("0.03 0 0.01", "too small: enter numbers in mm"),
-    "vehicle.gear_body_m": ("0 0 400", "0.4"),
+    "vehicle.gear_body_m": ("0 0 400", "allowed are -300 to 300 mm"),
     "target.large.side_m": ("15 cm", "numbers in mm"),
     "target.small.side_m": ("80", "less than half"),
     "safety.fence_radius_m": ("far", "numbers in m"),
@@ -184,7 +230,8 @@ def test_a_wrong_answer_is_asked_again_with_what_is_allowed(tmp_path: Path) -> N
 
 def test_a_ruler_s_millimetres_are_written_as_metres_and_one_may_go_back(tmp_path: Path) -> None:
     output = tmp_path / "mine.yaml"
-    typed = ["usb://0", "", "", "80", "back", "95 ms", "top", "left", "31.5, 0 -4 mm", "", "180"]
+    typed = ["usb://0", "", "", "", "80", "back", "95 ms", "top", "left"]
+    typed += ["31.5, 0 -4 mm", "", "180"]
     done = new(output, typed="\n".join([*typed, "", "", "", "back", "1.2", ""]) + "\n")
     assert done.exit_code == 0, done.stderr
     mine = load_profile(str(output))
@@ -199,7 +246,7 @@ def test_a_ruler_s_millimetres_are_written_as_metres_and_one_may_go_back(tmp_pat
 def test_a_latency_that_flights_measure_may_be_answered(tmp_path: Path, given: bool) -> None:
     output, settings = tmp_path / "mine.yaml", ["--set", "ceiling=2.4m"]
     settings += ["--set", "camera.latency_s=measured"] if given else []
-    typed = "\n" * 3 + ("" if given else "measured\n") + "\n" * 8
+    typed = "\n" * 4 + ("" if given else "measured\n") + "\n" * 8
     done = new(output, *settings, typed=typed)
     assert done.exit_code == 0, done.stderr
     assert load_profile(str(output)).camera.latency_s == "measured"
