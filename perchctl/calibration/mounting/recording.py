@@ -122,7 +122,7 @@ class MountingRecording:
                     raise InvalidValue(
                         f"{path} is not a recording from calibrate mount{note}"
                     ) from None
-                why = f"{error.args[0]} is missing" if isinstance(error, KeyError) else error
+                why = f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
                 raise InvalidValue(
                     f"{path}, line {number} is not a line of a calibrate mount recording: {why}"
                 ) from None
