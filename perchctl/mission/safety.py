@@ -74,8 +74,8 @@ further than any draught moves the vehicle. Larger: the vehicle reaches the wall
 SETPOINT_DISTANCE_LIMIT_PER_LATENCY_SIGMA_MPS = 4.0
 """How much the limit on the lateral distance from the setpoint increases with the uncertainty of
 the camera latency, m per second of its standard deviation, if the target is the position source.
-Pictures that arrive 0.1 s later than assumed displace the vehicle by up to 0.2 m. Larger: a rotated camera leads the vehicle further away.
-"""
+Pictures that arrive 0.1 s later than assumed displace the vehicle by up to 0.2 m. Larger: a rotated
+camera leads the vehicle further away."""
 MAX_LATERAL_SETPOINT_OFFSET_IN_VERTICAL_CLIMB_M = 0.1
 """Largest lateral distance between setpoint and start in a vertical climb, m."""
 ESTIMATE_CONTRADICTS_IMU_DWELL_S = 0.1
