@@ -368,7 +368,8 @@ def _restart_landing_by_catching_fall(c: Context) -> Action:
 
 
 def _catch_fall(c: Context) -> Action | None:
-    """Catch the fall under position control; None without a heading or with diverged positions."""
+    """Catch the fall under position control (`catch_falling_vehicle`); None without a heading, with
+    diverged positions, or if there is no fall to catch."""
     return (
         None
         if c.belief.is_heading_lost or c.belief.is_position_diverged
@@ -418,7 +419,8 @@ def make_onboard_landing_command(
     planner: PlannerConfig, ground_z_m: float, time_in_flight_s: float, vehicle_world_z_m: float
 ) -> Land:
     """Return the command for the firmware's own landing from height `vehicle_world_z_m`, a quintic
-    from rest to rest.
+    from rest to rest. Both heights are world z, m. The duration keeps the peak speed at or below
+    `ONBOARD_LANDING_PEAK_SPEED_MPS`.
 
     The motors stop at the end of the trajectory. The goal of the trajectory is therefore below the
     ground by more than the estimated height may have drifted during `time_in_flight_s`, and never

@@ -42,7 +42,9 @@ EXPECTED_BACK_OFF_DURATION_S = 3.0
 
 
 def compute_battery_outlook(c: Context) -> BatteryOutlook:
-    """Predict how long the battery lasts and for how many attempts it suffices.
+    """Predict how long the battery lasts and for how many attempts it suffices, from the battery
+    fit, the hover thrust and the predicted durations of attempts and landing. The number of
+    attempts is None until the target's position is known.
 
     If the charge is unknown, the remaining time for attempts is at most the time until row
     `battery-unknown` lands the vehicle.
@@ -79,8 +81,9 @@ def _is_battery_reading_missing(c: Context) -> bool:
 
 
 def _time_until_landing_must_begin_s(c: Context) -> float:
-    """Return the time left for attempts, s. If the charge is unknown, the time is at most that
-    until row `battery-unknown` lands the vehicle, minus the landing and the reserve."""
+    """Return the time left for attempts, s: the part of the predicted hover time that can be
+    counted on (`HoverTimes`). Without a prediction or a recent battery reading, the time is at most
+    that until row `battery-unknown` lands the vehicle, minus the landing and the reserve."""
     landing_duration_s = predict_durations(c).landing_duration_s
     reserve_s = c.safety.energy_reserve_s
     hover_times = _predict_hover_times_now(c)
@@ -229,7 +232,7 @@ def battery_shortfall_text(c: Context) -> str:
 
 def _time_left_without_battery_reading_s(c: Context) -> float:
     """Return the time left, s, until the row `battery-unknown` lands a vehicle without a battery
-    reading."""
+    reading: `safety.battery_stale_s` minus the time since the last reading."""
     return c.safety.battery_stale_s - max(
         c.belief.battery_fit.time_since_battery_reading_s, c.obs.battery_reading_age_s
     )

@@ -161,7 +161,8 @@ def _climb_rate_measured_at_s(c: Context) -> float:
 
 
 def _is_climb_rate_unknown(c: Context) -> bool:
-    """True if telemetry and pictures are too old to determine the vertical speed."""
+    """True if neither telemetry nor pictures have measured the vertical speed within the last
+    `hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S`."""
     return _climb_rate_measurement_age_s(c) > hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S
 
 
@@ -176,9 +177,9 @@ def _climb_rate_measurement_age_s(c: Context) -> float:
 
 
 def should_wait_for_climb_rate(c: Context) -> bool:
-    """True if neither climb rate nor hover thrust is known well enough for a descent by raw thrust;
-    in that case, the vehicle descends by setpoints, for at most
-    `MAX_DURATION_OF_DESCENT_BY_SETPOINTS_S`."""
+    """True if, before the first command of raw thrust, neither climb rate nor hover thrust is known
+    well enough for a descent by raw thrust; in that case, the vehicle descends by setpoints, for at
+    most `MAX_DURATION_OF_DESCENT_BY_SETPOINTS_S`."""
     begins_rough = (
         c.state.descent.last_commanded_raw_thrust == 0.0
         and c.belief.hover_thrust_estimate.is_imprecise
@@ -273,8 +274,9 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
 
 
 def _last_measured_climb_mps(c: Context) -> float:
-    """Return the last measured vertical speed, from telemetry or pictures; 0 if setpoints have held
-    the vehicle in place since the last telemetry."""
+    """Return the last measured vertical speed, m/s, positive up: from pictures if the telemetry is
+    old and they are newer, otherwise from telemetry; 0 if setpoints have held the vehicle in place
+    since the last telemetry."""
     seen = _visual_motion_if_telemetry_old(c)
     if seen is not None:
         return seen.vehicle_velocity_level_mps[2]
@@ -287,9 +289,10 @@ def _find_floor_detection_time_s(
 ) -> float | None:
     """Return the time at which the floor was first detected; None if it was not.
 
-    The floor is detected by an impact from below while the vehicle was sinking, or by pictures that
-    show no motion at a thrust too low to support the vehicle. `is_sinking`: the measured speed
-    shows a descent.
+    The floor is detected by an impact from below while the vehicle was sinking, at a `height_m`
+    above the ground of less than `MAX_FLOOR_IMPACT_HEIGHT_M`; or by pictures that show no motion,
+    clearly below the target, at a thrust too low compared with `hover_thrust` to support the
+    vehicle. `is_sinking`: the measured speed shows a descent.
     """
     descent, b, seen = c.state.descent, c.belief, _visual_motion_if_telemetry_old(c)
     if descent.floor_detected_at_s is not None:

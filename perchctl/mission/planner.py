@@ -39,7 +39,9 @@ def step_mission(
     profile: Profile,
     table: tuple[Transition, ...] = TABLE,
 ) -> tuple[PlannerState, Command]:
-    """Fly one tick of the mission; `state` is None in the first tick, on the ground."""
+    """Fly one tick of the mission: update the belief with the observation, enter the phase to which
+    a row of `table` leads, if one applies (`first_transition`), and return the new state with the
+    command of the resulting phase. `state` is None in the first tick, on the ground."""
     state = _update_before_decision(
         state or PlannerState.initial_on_ground(obs, profile), obs, profile
     )
@@ -136,7 +138,8 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
 
 
 def act_in_phase(c: Context) -> Action:
-    """Return the phase's new state and command for this tick."""
+    """Return the phase's new state and command for this tick. During a hold, the command keeps the
+    setpoint instead, unless RECOVER is catching a fall or ending a press."""
     state = c.state
     # A fall is caught and a press ended even during a hold, since the setpoint is above the
     # vehicle.

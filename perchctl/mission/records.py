@@ -62,8 +62,9 @@ class Event:
         obs: Observation,
         profile: Profile,
     ) -> list[Event]:
-        """Return the events of one tick; `previous_state` is the planner's state before the tick,
-        None in the first tick."""
+        """Return the events of one tick: a phase was entered, a pause began, or positions were
+        lost; in the first tick, the initial phase and a missing battery reading. `previous_state`
+        is the planner's state before the tick, None in the first tick."""
         events: list[Event] = []
         if previous_state is None:
             previous_state = PlannerState.initial_on_ground(obs, profile)
@@ -155,8 +156,9 @@ class TickInputs:
 
 @dataclass(frozen=True, eq=False)
 class UnfilteredPose:
-    """An unfiltered pose of the target: `t_s` and `e_m` of a `perchctl.vision.MarkerPose`, and its
-    `e_yaw_rad`."""
+    """An unfiltered pose of the target: `t_s` and `e_m` of a `perchctl.vision.MarkerPose` (exposure
+    time, and vector from the gear to the target in the level frame, m), and its `e_yaw_rad`, the
+    target's heading relative to the vehicle's."""
 
     t_s: float
     gear_to_target_level_m: Array

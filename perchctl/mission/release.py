@@ -164,7 +164,9 @@ def transfer_weight_by_raw_thrust(c: Context, *, max_telemetry_age_s: float = 0.
 
 def hold_contact_by_position(c: Context) -> Action:
     """Hold by position control while the telemetry is old, to stay in contact or to catch an
-    undetected fall."""
+    undetected fall. The setpoint is above the recorded contact or, without a contact or a valid
+    position, above the vehicle's last reported height. The weight transfer begins anew
+    afterwards."""
     state, tel, b = c.state, c.telemetry, c.belief
     x, y, z_m = tel.position_m
     if b.vehicle_world_z_at_last_contact_m is not None and b.is_position_valid:
@@ -222,7 +224,8 @@ def choose_catch_setpoint_height_above_vehicle_m(
     hover_thrust: float, reported_thrust: float
 ) -> float:
     """Return how far above a falling vehicle, m, a setpoint must be to catch the fall. The height
-    depends on whether the motors turn, which the reported and the hover thrust (0..65535) show."""
+    is smaller if the motors are turning, that is, if the reported thrust exceeds
+    `MIN_THRUST_TO_HOVER_RATIO_IF_MOTORS_ON` times hover thrust (both 0..65535)."""
     turning = reported_thrust > MIN_THRUST_TO_HOVER_RATIO_IF_MOTORS_ON * hover_thrust
     return (
         CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_ON_M
@@ -232,8 +235,10 @@ def choose_catch_setpoint_height_above_vehicle_m(
 
 
 def catch_falling_vehicle(c: Context) -> Action | None:
-    """Catch a vehicle that is falling off the magnet: return a setpoint high above it. None if
-    there is nothing to catch, once the fall has ended, or with old telemetry."""
+    """Catch a vehicle that is falling off the magnet: return a setpoint above it by the height that
+    the state prepared for the catch. None if no catch is prepared, with old telemetry, or once the
+    climb rate exceeds `MIN_CLIMB_RATE_TO_END_FALL_CATCH_MPS` or the catch has lasted
+    `MAX_FALL_CATCH_DURATION_S`."""
     state, tel, b = c.state, c.telemetry, c.belief
     if state.catch_setpoint_height_above_vehicle_m is None or not b.is_imu_fresh:
         return None

@@ -67,9 +67,9 @@ class Touchdown:
 
 @dataclass(frozen=True)
 class CameraFindings:
-    """Latency, and rotation of the camera relative to the profile about body x, y and z, each with
-    one standard deviation. `advice` is a tuple of sentences; it is empty if the profile fits, and
-    for a simulated vehicle because its camera is not a real one."""
+    """Latency, s, and rotation of the camera relative to the profile about body x, y and z,
+    degrees, each with one standard deviation. `advice` is a tuple of sentences; it is empty if the
+    profile fits, and for a simulated vehicle because its camera is not a real one."""
 
     measured_latency_s: float
     latency_sigma_s: float
@@ -134,8 +134,8 @@ class CameraFindings:
 
 
 def _is_significant(difference: float, threshold: float, sigma: float) -> bool:
-    """True if the difference exceeds both the threshold and 3.92 `sigma`, the full width of its 95
-    % interval."""
+    """True if the magnitude of the difference exceeds both the threshold and 3.92 `sigma`, the full
+    width of its 95 % interval. All three have the same unit."""
     return abs(difference) > max(threshold, 2.0 * SIGMAS_FOR_95_PERCENT_INTERVAL * sigma)
 
 
@@ -203,7 +203,9 @@ class FlightReport:
         *,
         simulated: bool = False,
     ) -> FlightReport:
-        """Return the report of a completed mission from its last tick."""
+        """Return the report of a completed mission from its last tick: the final `state` and `obs`,
+        the flight's events `history`, and the estimated `camera_errors`, None if the flight was too
+        short to estimate them. A `simulated` flight gives no advice about its camera."""
         b = state.belief.with_observation(obs, profile)
         hangs, contact = state.phase is Phase.PERCHED, b.gear_to_target_at_last_contact
         if hangs and contact is None:  # the magnet caught the vehicle during the descent
@@ -252,8 +254,8 @@ class RestReport:
 def report_rest(
     state: PlannerState, obs: Observation, profile: Profile, min_motors_off_s: float
 ) -> RestReport | None:
-    """Return the rest state; None until telemetry has shown the motors off for
-    `min_motors_off_s`."""
+    """Return the rest state, with the touchdown unless the magnet or another object holds the
+    vehicle; None until telemetry has shown the motors off for `min_motors_off_s`."""
     c = Context(replace(state, belief=state.belief.with_observation(obs, profile)))
     if c.true_for_s(MOTORS_OFF_AS_COMMANDED) < min_motors_off_s:
         return None

@@ -37,8 +37,15 @@ class RestState(Enum):
 
 
 def find_rest_state(c: Context) -> RestState:
-    """Return the rest state once the motors are off: from a position, from a picture of a target
-    far above, or from the falls measured since the vehicle came within the magnet's reach."""
+    """Return the rest state once the motors are off. It is HELD if an object other than the target
+    holds the vehicle.
+
+    With a valid position from a deck or motion capture, the vehicle hangs if no target is far
+    above, and it either has hardly come down since the phase began high above the ground or has a
+    recorded contact and is too high to rest on the floor; otherwise, it stands. Without such a
+    position, it stands if a tracked target is far above; otherwise, the falls measured since it
+    came within the magnet's reach decide (`_find_rest_state_from_falls`).
+    """
     b, state = c.belief, c.state
     if _is_held_by_other_object(c):
         return RestState.HELD

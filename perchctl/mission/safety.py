@@ -109,7 +109,8 @@ ends the flight."""
 def is_position_control_diverging(c: Context) -> bool:
     """True if position control leads the vehicle away from its setpoint, as with external positions
     in wrong axes: it is further away than any draught could move it, it oscillates, or its
-    estimated velocity contradicts the accelerometer."""
+    estimated velocity contradicts the accelerometer. Always False with a deck or without a valid
+    position."""
     setpoint, phase, b = c.state.setpoint, c.state.phase, c.belief
     if b.profile.positioning.source.is_deck or not b.is_position_valid:
         return False
@@ -307,7 +308,9 @@ def is_climb_blocked(c: Context) -> bool:
 
 
 def is_climb_blocked_off_target(c: Context) -> bool:
-    """True if the vehicle is blocked at a position where a press would not prove the contact."""
+    """True if the vehicle is blocked at a position where a press would not prove the contact: in
+    any phase but PERCH, or in PERCH with the gear further from the target's height than
+    `contact_height_tolerance_m`."""
     pressing = c.state.phase is Phase.PERCH
     return is_climb_blocked(c) and not (
         pressing and abs(c.belief.target.gear_to_target_z_m) <= contact_height_tolerance_m(c.belief)

@@ -112,9 +112,10 @@ def step_setpoint_towards(
     changes_heading: bool = True,
 ) -> PositionSetpoint:
     """Return the setpoint of the next tick: `old`, moved towards `goal` with a speed of at most
-    `max_up_mps` upwards and `max_down_mps` downwards.
-    `limits_speed_until_camera_mounting_confirmed` limits the lateral speed while the camera's
-    mounting is unconfirmed. If `changes_heading` is False, the heading stays."""
+    `max_up_mps` upwards, `max_down_mps` downwards and `align.speed_mps` laterally, and turned at no
+    more than `align.yaw_rate_dps`. With `limits_speed_until_camera_mounting_confirmed`, the lateral
+    speed is lower while the camera's mounting is unconfirmed, and zero without a fresh target. If
+    `changes_heading` is False, the heading stays."""
     dt_s, align = c.t_s - c.state.t_s, c.planner.align
     xy_mps, yaw_radps = align.speed_mps, math.radians(align.yaw_rate_dps)
     if not changes_heading:
@@ -149,8 +150,9 @@ def fly_to(c: Context, reference: PositionSetpoint, *, corrects_height: bool = T
 
 
 def fly_under_target(c: Context, vehicle_world_z_m: float, *, max_up_mps: float = 0.0) -> Action:
-    """Move under the target at height `vehicle_world_z_m`, and learn the integral that keeps the
-    gear there."""
+    """Move under the target at height `vehicle_world_z_m` (world z of the body), and learn the
+    integral that keeps the gear there. The setpoint climbs at no more than `max_up_mps`; by
+    default, it does not climb."""
     goal = make_setpoint_under_target(c, vehicle_world_z_m)
     lateral_integral_m = update_lateral_integral(c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s)
     c = Context(replace(c.state, lateral_integral_m=lateral_integral_m))

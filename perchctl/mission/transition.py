@@ -94,7 +94,8 @@ def land_row(
     outcome: Outcome = Outcome.SAFETY,
     diagnosis: VehicleDiagnosis = VehicleDiagnosis.NONE,
 ) -> Transition:
-    """Return a row that ends the mission and starts the landing."""
+    """Return a row that ends the mission and starts the landing from any of `phases` once `when` is
+    true. The other arguments are the fields of `Transition`."""
     return Transition(
         name, phases, when, Phase.LANDING, reason, Severity.LAND, outcome, diagnosis=diagnosis
     )
@@ -107,7 +108,9 @@ def back_off_row(
     reason: Reason,
     diagnosis: VehicleDiagnosis = VehicleDiagnosis.NONE,
 ) -> Transition:
-    """Return a row that ends the attempt: descend a little and try again."""
+    """Return a row into RECOVER from any of `phases` once `when` is true. It ends the attempt,
+    which counts as failed: the vehicle descends a little and tries again. The other arguments are
+    the fields of `Transition`."""
     return Transition(
         name, phases, when, Phase.RECOVER, reason, Severity.BACK_OFF, diagnosis=diagnosis
     )

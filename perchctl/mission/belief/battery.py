@@ -213,10 +213,13 @@ def update_battery_fit(
     battery_capacity_mah: float,
     power_train: PowerTrain,
 ) -> BatteryFit:
-    """Return the fit `dt_s` later, with the commanded thrust (0..65535) and the battery's full
-    charge `battery_capacity_mah`.
+    """Return the fit `dt_s` later, after the voltage reading `battery_v`, V, at the commanded
+    thrust `thrust` (0..65535), for a battery with the full charge `battery_capacity_mah`.
 
-    A `battery_v` that is NaN or outside the range of a cell counts as missing. The charge that the
+    Before the first load, a reading without thrust is the resting voltage. Under load, the resting
+    voltage is the reading plus the fitted sag, passed through a low-pass filter, and the reading is
+    added to the sums of the fit. While the thrust is changing, the reading is ignored. A
+    `battery_v` that is NaN or outside the range of a cell counts as missing. The charge that the
     thrust consumes is then subtracted from the estimate.
     """
     thrust_fraction = max(0.0, min(1.0, thrust / FULL_THRUST))
@@ -310,7 +313,8 @@ def fit_battery_voltage_model(state: BatteryFit) -> BatteryVoltageModel:
 
 
 def charge_fraction_from_rest_v(rest_v: float) -> float:
-    """Return the charge (0..1) of a cell with the resting voltage `rest_v`."""
+    """Return the charge (0..1) of a cell with the resting voltage `rest_v`, V, interpolated
+    linearly in the discharge curve. The result is clamped to 0..1."""
     return min(
         1.0,
         max(
@@ -321,7 +325,8 @@ def charge_fraction_from_rest_v(rest_v: float) -> float:
 
 
 def rest_v_from_charge_fraction(charge_fraction: float) -> float:
-    """Return the resting voltage, V, of a cell with the charge `charge_fraction` (0..1)."""
+    """Return the resting voltage, V, of a cell with the charge `charge_fraction` (0..1),
+    interpolated linearly in the discharge curve."""
     return _interpolate(
         DISCHARGE_CURVE_CHARGE_FRACTIONS, DISCHARGE_CURVE_REST_VOLTAGES_V, charge_fraction
     )

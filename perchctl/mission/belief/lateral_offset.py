@@ -234,8 +234,9 @@ class LateralOffsetFilter:
     def _with_velocity_measurement(
         self, estimated_velocity_world_xy_mps: LateralVector
     ) -> LateralOffsetFilter:
-        """Return the filter after a measurement of the vehicle's velocity at the filter's time,
-        `t_s`."""
+        """Return the filter after a Kalman update, at its own time `t_s`, with the vehicle's
+        velocity from the state estimate (world x and y), which has the standard deviation
+        `ESTIMATED_VELOCITY_SIGMA_MPS` per axis."""
         p_ee, p_ev, p_vv = self.covariance
         variance = p_vv + ESTIMATED_VELOCITY_SIGMA_MPS**2
         gain_e, gain_v = p_ev / variance, p_vv / variance

@@ -140,12 +140,15 @@ class FusionAge:
     fusion_stopped_at_s: float = math.inf  # time from which the variance has only grown
 
     def age_s(self, now_s: float) -> float:
-        """Age of the last correction, s, if corrections have certainly stopped; otherwise 0."""
+        """Age of the last correction at the time `now_s`, s, if corrections have certainly stopped,
+        that is, if the variance has only grown for `NO_FUSION_TIMEOUT_S`; otherwise 0."""
         certain = self.variance_changed_at_s - self.fusion_stopped_at_s >= NO_FUSION_TIMEOUT_S
         return now_s - self.fusion_stopped_at_s if certain else 0.0
 
     def update(self, sample: Telemetry) -> FusionAge:
-        """Return the age after one more sample; unchanged if the sample has no new variance."""
+        """Return the age after one more sample; unchanged if the sample has no new variance. A new
+        variance shows a correction if it has grown more slowly than
+        `MIN_VARIANCE_GROWTH_WITHOUT_FUSION_M2PS2_PER_S`."""
         variance, before = sample.climb_variance_m2ps2, self.climb_variance_m2ps2
         if variance is None or variance == before:
             return self
@@ -199,8 +202,9 @@ class FreezeDetector:
         return max(0.0, self.position_frozen_for_s - self.acceleration_frozen_for_s)
 
     def update_freeze(self, last: Telemetry | None, new: Telemetry) -> Self:
-        """Return the detector after one more sample. `last` is None for the first sample, which has
-        no predecessor."""
+        """Return the detector after one more sample. The time of a reading that equals the one in
+        `last` grows by the time between the samples; otherwise, it becomes 0. `last` is None for
+        the first sample, which changes nothing."""
         return replace(
             self,
             acceleration_frozen_for_s=_update_frozen_time_s(

@@ -74,8 +74,8 @@ class CameraMountingSample:
 def make_camera_mounting_sample(
     t_s: float, telemetry: Telemetry, target_world_m: Array
 ) -> CameraMountingSample:
-    """Return the sample for a target at `target_world_m` (3,), world, and the vehicle's pose in
-    `telemetry`."""
+    """Return the sample at the loop time `t_s` for a target at `target_world_m` (3,), in the world
+    frame of the state estimate, and the vehicle's estimated pose in `telemetry`."""
     x, y, z = telemetry.position_m
     up = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)[:, 2]
     vehicle_to_up_axis_at_target_height_world_xy_m = (float(target_world_m[2]) - z) * up
@@ -121,6 +121,11 @@ def update_camera_mounting_monitor(
     old: CameraMountingMonitor, sample: CameraMountingSample
 ) -> CameraMountingMonitor:
     """Return the monitor after one more frame that measured the target.
+
+    Once the vehicle's upward axis has moved far enough, a complex least-squares fit relates the
+    target's apparent motion to that of the axis (module docstring). If the target hardly moves, it
+    is stationary, and more motion of the axis confirms the mounting. The sighting contradicts the
+    mounting if the target moves as a large rotation of the camera would make it move.
 
     Once the mounting is confirmed or found wrong, nothing changes any more. After a jump of the
     target or of the state estimate, the check starts again and pauses for `JUMP_PAUSE_S`. Sightings

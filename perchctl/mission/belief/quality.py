@@ -87,7 +87,12 @@ QUALITY_CONDITIONS = (
 
 def hold_reason(b: Belief, maneuver: Maneuver) -> str:
     """Return why the vehicle must hold its position in this tick of the maneuver, or an empty
-    string."""
+    string.
+
+    In free air, the reason is a stale position. In a maneuver guided by the camera, it is also old
+    telemetry, a jump or an excessive variance of the state estimate, a late control loop or, if the
+    maneuver requires pictures, an old picture.
+    """
     safety = b.profile.safety
     if maneuver.is_in_free_air and b.is_position_stale:
         return position_loss_text(b)

@@ -148,7 +148,9 @@ def advance_dead_reckoning(
     is_estimated_velocity_being_corrected: bool = False,
     ignores_lateral_estimate: bool = False,
 ) -> DeadReckoning:
-    """Return the dead reckoning one tick later.
+    """Return the dead reckoning one tick later, advanced by the velocity that `imu` has gained
+    since `old`. `sample` is the newest sample of `imu`. At the first sample, after a gap in the
+    telemetry, or while the attitude is frozen, the dead reckoning restarts instead.
 
     - `is_estimate_trusted`: adopt the sample's estimated velocity, and learn from it the bias of
       the acceleration, which is due to accelerometer and attitude.
@@ -415,8 +417,9 @@ def learn_acceleration_bias_at_rest(
 ) -> DeadReckoning:
     """Return the dead reckoning of a vehicle that is held still, so that the whole lateral
     acceleration between `previous_imu` and `imu` is the combined bias of accelerometer and
-    attitude. The bias learned in flight does not apply: in wind, the estimated attitude has an
-    error that disappears within a second after the contact."""
+    attitude. A low-pass filter learns this bias; it is unchanged after a gap in the telemetry. The
+    bias learned in flight does not apply: in wind, the estimated attitude has an error that
+    disappears within a second after the contact."""
     if (
         previous_imu is None
         or not 0.0 < imu.t_s - previous_imu.t_s <= MAX_TELEMETRY_GAP_S
@@ -449,9 +452,10 @@ def restart_velocity_bias_filters(old: DeadReckoning) -> DeadReckoning:
 
 
 def correct_acceleration_bias_for_wrong_positions(old: DeadReckoning) -> DeadReckoning:
-    """Return the dead reckoning with its acceleration bias corrected after positions in wrong axes.
-    Such positions have given the state estimate a velocity that the accelerometer has not measured
-    and, in proportion to it, a wrong tilt, which was learned as a bias."""
+    """Return the dead reckoning with its lateral acceleration bias corrected after positions in
+    wrong axes. Such positions have given the state estimate a velocity that the accelerometer has
+    not measured and, in proportion to it, a wrong tilt, which was learned as a bias. The correction
+    is this velocity times `VELOCITY_MISSED_BY_IMU_TO_BIAS_GAIN_PER_S`."""
     (bx, by, bz), (x_mps, y_mps) = (
         old.acceleration_bias_world_mps2,
         old.lateral_velocity_missed_by_imu_mps,
@@ -469,9 +473,10 @@ def correct_acceleration_bias_for_wrong_positions(old: DeadReckoning) -> DeadRec
 def accumulate_unexplained_position_step(
     old: DeadReckoning, last: Telemetry, sample: Telemetry
 ) -> DeadReckoning:
-    """Return the dead reckoning with one more step of the estimated position added to their sum,
-    which makes the offset at a contact less certain. A step is the motion between two samples
-    beyond what the estimated velocity explains. After a gap in the samples, no step is added."""
+    """Return the dead reckoning with one more lateral step of the estimated position added to their
+    sum, which makes the offset at a contact less certain. A step is the motion from `last` to
+    `sample` beyond what the estimated velocity explains. Steps below a threshold that grows with
+    the time between the samples are ignored. After a gap in the samples, no step is added."""
     dt_s = _position_timestamp_s(sample) - _position_timestamp_s(last)
     if not 0.0 < dt_s <= MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S:
         return old
@@ -508,10 +513,12 @@ def restart_dead_reckoning_at_sighting(
     gear_below_target_m: float,
     sigma_m: float,
 ) -> DeadReckoning:
-    """Return the dead reckoning restarted at a sighting.
+    """Return the dead reckoning whose offset from the target restarts at a sighting exposed at
+    `t_s`; the velocity is kept.
 
     `gear_to_target_world_xy_m` is the vector from the gear to the target (world x, y), with the
-    standard deviation `sigma_m`; `gear_below_target_m` is how far the gear is below the target.
+    standard deviation `sigma_m` per axis; `gear_below_target_m` is how far the gear is below the
+    target.
     """
     return replace(
         old,

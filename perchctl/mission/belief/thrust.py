@@ -80,8 +80,9 @@ class HoverThrust:
         )
 
     def with_measurement(self, thrust: float, dt_s: float) -> HoverThrust:
-        """Return the estimate after a measurement: the mean thrust over `dt_s`. A longer time gives
-        the measurement more weight; if `dt_s` is 0, nothing changes."""
+        """Return the estimate after a Kalman update with `thrust`, the mean thrust over `dt_s`,
+        0..65535. A longer time gives the measurement more weight; if `dt_s` is 0, nothing
+        changes."""
         if dt_s <= 0.0:
             return self
         if math.isinf(self.sigma_fraction):

@@ -452,7 +452,12 @@ def _correct_height_of_supported_vehicle(b: Belief, new: DeadReckoning) -> DeadR
 
 def _find_magnet_reach_entry_time_s(b: Belief, new: DeadReckoning) -> float | None:
     """Return the loop time from which the magnet may have held the vehicle; None if it cannot hold
-    it."""
+    it, because no contact is recorded and either the dead reckoning `new` places the gear outside
+    the magnet's reach or the floor was detected.
+
+    The time is that of the first tick within reach, or of a later tick within reach after a fall.
+    Once the weight transfer or the motor stop has begun, it does not change.
+    """
     magnet_reach_entered_at_s = b.magnet_reach_entered_at_s
     # once the weight transfer or the motor stop has begun, the vehicle does not move into or out of
     # the magnet's reach
@@ -475,8 +480,9 @@ def _find_magnet_reach_entry_time_s(b: Belief, new: DeadReckoning) -> float | No
 
 
 def _climb_since_last_tick_m(b: Belief, new: DeadReckoning) -> float:
-    """Return how far a vehicle without a position has climbed since the previous tick, m; 0 for a
-    vehicle with a position."""
+    """Return how far a vehicle without a position has climbed since the previous tick, m, positive
+    up: the climb rate of the dead reckoning `new` times the time or, after a gap in the telemetry,
+    the change of the estimated height. 0 for a vehicle with a position."""
     obs, before, last = b.obs, b.dead_reckoning.imu, b.last_telemetry
     if b.dead_reckoning_began_at_s is None or before is None:
         return 0.0

@@ -51,7 +51,8 @@ def act_in_align(c: Context) -> Action:
 
 
 def is_aligned(c: Context) -> bool:
-    """True once the vehicle has been aligned for `align.dwell_s`."""
+    """True once the vehicle has been aligned for `align.dwell_s`: its gear is within `align.xy_m`
+    of the axis of a fresh target, and its heading within `align.yaw_deg` of the target's."""
     return c.true_for_s(ALIGNED) >= c.planner.align.dwell_s
 
 

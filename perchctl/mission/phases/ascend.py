@@ -50,7 +50,8 @@ def ascent_cone_radius_m(c: Context) -> float:
 
 
 def ascent_end_distance_below_target_m(c: Context) -> float:
-    """Return the distance of the gear below the target at which the ascent ends, m."""
+    """Return the distance of the gear below the target at which the ascent ends, m: the stand-off
+    or, if the mission hovers, the distance at which it hovers."""
     hover = c.planner.hover
     return c.planner.ascend.standoff_m if hover is None else hover.below_m
 
@@ -65,8 +66,9 @@ def has_reached_ascent_end_height(c: Context) -> bool:
 
 
 def _is_settled_at_standoff(c: Context) -> bool:
-    """True if the vehicle is slow and below the target at the stand-off, and the camera has seen
-    the small marker recently."""
+    """True if the vehicle is slow and below the target, at the stand-off height and with the
+    target's heading, within the `ascend.settle_*` tolerances, and the camera has seen the small
+    marker recently."""
     ascend, target, lateral = (
         c.planner.ascend,
         c.belief.target,

@@ -54,7 +54,8 @@ STEADY_AFTER_ATTEMPT = Condition[Context](
 
 
 def enter_recover(state: PlannerState, previous_context: Context) -> PlannerState:
-    """Record the last touch, and prepare a catch if the vehicle is falling."""
+    """Record the last touch and the height of a contact or obstacle, and prepare a catch if the
+    vehicle has slipped off its contact with too little thrust to carry most of its weight."""
     old, b, diagnosis = previous_context.state, previous_context.belief, state.entry.diagnosis
     z_m, thrust = b.telemetry.position_m[2], b.telemetry.thrust
     touched = old.phase is Phase.PERCH or VehicleDiagnosis.BLOCKED_BY_OBSTACLE in diagnosis
@@ -89,7 +90,13 @@ def _find_gear_to_target_at_touch(
     previous_context: Context, diagnosis: VehicleDiagnosis
 ) -> GearToTargetDistance | None:
     """Return the distance between gear and target at the touch that ended the attempt; None if no
-    touch is known."""
+    touch is known. `previous_context` is from the tick before the transition into RECOVER, and
+    `diagnosis` is what the transition asserts.
+
+    If the vehicle is still at its contact, the recorded distance is returned. A press counts as a
+    touch only if, at the target's height, a contact was proven or accelerometer and thrust showed
+    support.
+    """
     old, b = previous_context.state, previous_context.belief
     # the contact was proven, and the vehicle has not come off
     if VehicleDiagnosis.STILL_AT_PROVEN_CONTACT in diagnosis:
@@ -109,7 +116,9 @@ def _find_gear_to_target_at_touch(
 
 
 def act_in_recover(c: Context) -> Action:
-    """Hold `descend_m` below the position where the attempt ended, in position mode throughout."""
+    """Catch a fall and end the press first. Then hold `recover.descend_m` below the position where
+    the attempt ended or, if the target was seen recently, below the target at that height, in
+    position mode throughout. After a catch, the height is that at which the fall stopped."""
     if (caught := catch_falling_vehicle(c)) is not None:
         return caught
     recover = c.planner.recover
@@ -144,7 +153,8 @@ def act_in_recover(c: Context) -> Action:
 
 
 def has_recovered(c: Context) -> bool:
-    """True if the vehicle has been steady for `recover.dwell_s`, away from its contact."""
+    """True if the vehicle has been slower than `recover.steady_mps` for `recover.dwell_s` and is
+    away from its contact."""
     dwell_s = c.planner.recover.dwell_s
     steady = c.true_for_s(STEADY_AFTER_ATTEMPT) >= dwell_s and c.time_in_phase_s >= dwell_s
     return steady and c.belief.vehicle_world_z_at_last_contact_m is None

@@ -38,8 +38,9 @@ def enter_search(state: PlannerState, previous_context: Context) -> PlannerState
 
 
 def act_in_search(c: Context) -> Action:
-    """Wait, climb one step, turn one step and wait again, never above the height limit. If the
-    target was seen before, search from below its last position instead."""
+    """Every `search.wait_s`, climb by `search.step_m` and turn by `search.yaw_step_deg`, never
+    above the height limit or close to a known obstacle. If the target was seen before, search from
+    below its last position instead, turning without climbing."""
     search, state, b = c.planner.search, c.state, c.belief
     takeoff_position_m = b.takeoff_position_m
     assert takeoff_position_m is not None
@@ -76,9 +77,9 @@ def _limit_move_before_camera_mounting_check(
     start_world_xy_m: tuple[float, float],
     goal_world_xy_m: tuple[float, float],
 ) -> tuple[float, float]:
-    """Return the goal, world x and y (m), limited to
+    """Return the goal, world x and y (m), moved so that it is at most
     `MAX_LATERAL_MOVE_BEFORE_CAMERA_MOUNTING_CHECK_M` from the vehicle's position at the last
-    sighting of the target, or from `start_world_xy_m` if there was none."""
+    sighting in `mounting`, or from `start_world_xy_m` if there was none."""
     if mounting.sightings:
         start_world_xy_m = (
             mounting.sightings[-1].vehicle_world_xy_m.real,
