@@ -91,8 +91,9 @@ def deinterlace_image(image: GreyImage) -> tuple[GreyImage, ...]:
 
 
 def interpolate_field(image: GreyImage, first_row: int) -> GreyImage:
-    """Return the top field (`first_row` 0) or the bottom field (`first_row` 1), with the missing
-    rows interpolated."""
+    """Return the top field (`first_row` 0: rows 0, 2, ...) or the bottom field (`first_row` 1: rows
+    1, 3, ...) of an interlaced image (h, w) at full height. The rows of the other field are
+    replaced by a cubic interpolation between the field's own rows."""
     own = image[first_row::2]
     # Row k of the interpolation is between rows k and k + 1 of the field.
     between = cv2.filter2D(
@@ -109,7 +110,9 @@ def interpolate_field(image: GreyImage, first_row: int) -> GreyImage:
 
 def interpolated_field_edge_sigma_px(blur_sigma_px: float) -> float:
     """Return the standard deviation of the position of a nearly horizontal edge, px, in an
-    interpolated field. `blur_sigma_px` is the standard deviation of the edge's blur."""
+    interpolated field. It is due to aliasing, because a field only has every second row, and
+    becomes smaller as the blur grows. `blur_sigma_px` is the standard deviation of the edge's blur,
+    px."""
     return _ALIASING_SIGMA_PX * math.exp(-_ALIASING_DECAY_PER_PX2 * blur_sigma_px * blur_sigma_px)
 
 
@@ -134,10 +137,13 @@ def interpolate_fields(frame: Frame) -> tuple[Frame, Frame]:
 
 
 def deinterlace_frame(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[Frame, ...]]:
-    """Return the new state and the images to process, in time order: the frame itself, or its two
-    fields. The fields' times are a quarter of the frame period before and after the frame's time.
+    """Return the new state and the images to process, in time order: the two fields of a woven
+    frame if the order of the fields is known, otherwise the frame itself. The fields' times are a
+    quarter of the frame period before and after the frame's time.
 
-    Until combing is found in a frame, only every third frame is checked.
+    The order of the fields follows from successive woven frames: the later field of a frame is more
+    similar to the earlier field of the next one. Until combing is found in a frame, only every
+    third frame is checked.
     """
     skip = (
         frame.picture_kind is None

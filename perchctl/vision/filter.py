@@ -81,7 +81,8 @@ class ProcessNoise:
     @cached_property
     def yaw_xyz_rate_noise_cov_per_s(self) -> Array:
         """Covariance (4, 4) that white-noise acceleration of the target adds per second to the
-        rates of (yaw, x, y, z)."""
+        rates of (yaw, x, y, z): rad^2/s^2 for the yaw rate and m^2/s^2 for the velocities, each per
+        second. It is the variance of the accelerations times their correlation time."""
         push = np.array(
             [
                 self.target_heading_acceleration_sigma_radps2,
@@ -132,8 +133,8 @@ class FilterSetup:
 
 @dataclass(frozen=True, eq=False)
 class TrackMeasurement:
-    """A measurement of a target, `z` = (yaw, x, y, z), (4,), and its covariance `R` (4, 4). If `R`
-    is None, the R of the filter setup is used.
+    """A measurement of a target, `z` = (yaw, x, y, z), (4,), rad and m, in the track's frame (level
+    or world), and its covariance `R` (4, 4). If `R` is None, the R of the filter setup is used.
 
     `yaw_xyz_shift_per_bias_sigma` (4, 4) has one row per element of z and one column per bias: the
     vehicle's roll and pitch, the print's size and curl. A column is the change of z for one
@@ -156,9 +157,14 @@ def _import_filterpy_predict() -> Callable[..., tuple[Array, Array]]:
 
 
 def make_filter_setup(config: KalmanConfig, is_world_frame: bool = False) -> FilterSetup:
-    """Return the filter's parameters. The initial standard deviation of the velocity is 5 cm/s in
-    the world frame. In the level frame, it is 30 cm/s, or 1 m/s if ``kalman.noise`` is
-    ``measured``."""
+    """Return the filter's parameters from the profile's `kalman` section, for tracks in the world
+    frame (if `is_world_frame`) or in the level frame.
+
+    With ``kalman.noise: measured``, the noise comes from accelerations and from the covariance of
+    each pose; otherwise it is `k1` and `k2` of the paper. The initial standard deviation of the
+    velocity is 5 cm/s in the world frame. In the level frame, it is 30 cm/s, or 1 m/s if
+    ``kalman.noise`` is ``measured``.
+    """
     _import_filterpy_predict()  # import it now so that no frame has to wait for the import
     measured = config.noise == "measured"
     level_rate = 100.0 if measured else 30.0
@@ -200,15 +206,20 @@ def vector_jacobian_wrt_tilt(vector_m: Array) -> Array:
 
 
 def transition_matrix(dt_s: float) -> Array:
-    """Return the state transition matrix F (8, 8) for a time step `dt_s` (paper, equation 1)."""
+    """Return the state transition matrix F (8, 8) for a time step `dt_s` (paper, equation 1): yaw,
+    x, y and z each change by their rate times `dt_s`, and the rates stay constant."""
     return _IDENTITY_8 + dt_s * _RATE_INTEGRATION_MATRIX
 
 
 def process_noise_covariance(dt_s: float, target_position_m: Array, setup: FilterSetup) -> Array:
     """Return the process noise Q (8, 8) over `dt_s` for a target at `target_position_m` (3,) in the
-    track's frame: relative to the gear in level axes, or in the world. The noise grows with the
-    target's distance because rotations of the level frame move a distant target further than a
-    close one."""
+    track's frame: relative to the gear in level axes, or in the world.
+
+    The noise is that of white-noise accelerations, plus the drift of the state estimate in the
+    world frame. In the level frame, it grows with the target's distance because rotations of the
+    frame move a distant target further than a close one. Without
+    `setup.acceleration_process_noise`, the result is `setup.Q`, which does not depend on `dt_s`.
+    """
     noise = setup.acceleration_process_noise
     if noise is None:
         return setup.Q
@@ -322,14 +333,18 @@ def step_track(
 
 
 def _innovation(x: Array, z: Array) -> Array:
-    """Return the innovation (4,): measurement minus prediction, with the yaw difference wrapped."""
+    """Return the innovation (4,) of (yaw, x, y, z), rad and m: the measurement `z` (4,) minus the
+    prediction in the state `x` (8,), with the yaw difference wrapped."""
     off = z - x[MEASURED]
     off[0] = wrap_rad(float(off[0]))
     return off
 
 
 def _kalman_update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Array]:
-    """Return the updated state, its covariance in Joseph form, and the Kalman gain (8, 4)."""
+    """Return the updated state, its covariance in Joseph form, and the Kalman gain (8, 4), given
+    the predicted state `x` (8,) with covariance `P` (8, 8) and the measurement `z` = (yaw, x, y,
+    z), (4,), with covariance `R` (4, 4). If the innovation's covariance is not positive definite,
+    the measurement is ignored and the gain is 0."""
     off = _innovation(x, z)
     regular, solved = cv2.solve(P[MEASURED, MEASURED] + R, P[MEASURED], flags=cv2.DECOMP_CHOLESKY)
     if not regular:  # S is not positive definite, so the measurement is ignored
@@ -367,7 +382,8 @@ def _predict_from_state(
 ) -> MarkerTrack:
     """Return the track at `t_s` without a measurement: its covariance is predicted over `dt_s`, and
     its state is predicted from `x` (8,) instead of the track's own state. The caller has reduced
-    the velocities in `x` if the target was not seen."""
+    the velocities in `x` if the target was not seen. `unseen_frames` becomes the new track's number
+    of frames since the last measurement."""
     x = _limit_target_speed(x, setup)
     F = transition_matrix(dt_s)
     x, P = _import_filterpy_predict()(

@@ -58,8 +58,9 @@ def distort_to_px(points_normalised: Array, camera: CameraModel) -> Array:
 
 
 def project(points_m: Array, rvec_rad: Array, tvec_m: Array, camera: CameraModel) -> Array:
-    """Project points (n, 3) to pixels (n, 2). The points' frame has the pose (rvec, tvec) in the
-    camera frame."""
+    """Project points (n, 3), m, to pixels (n, 2) of the distorted image. The points' frame has the
+    pose (rvec, tvec) in the camera frame. The pixels of points behind the camera are
+    meaningless."""
     points = np.ascontiguousarray(points_m, dtype=np.float64).reshape(-1, 1, 3)
     rvec, tvec = np.asarray(rvec_rad, float).ravel(), np.asarray(tvec_m, float).ravel()
     return _project_points(points, rvec, tvec, camera)

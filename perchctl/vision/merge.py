@@ -71,9 +71,12 @@ def estimate_marker_poses(
     setup: PoseSetup,
 ) -> MarkerPoses:
     """Estimate the poses of the markers detected in one frame, and assign them to the tracks that
-    they update.
+    they update: a single track ``joint``, or one track for each marker, depending on
+    `merge.method`. If the two markers contradict each other, only the more certain pose updates a
+    track.
 
-    `start_pose` is the last pose of the target, corrected for the vehicle's motion since then.
+    `attitude` is the vehicle's attitude at the time of the frame (None if unknown). `start_pose` is
+    the last pose of the target, corrected for the vehicle's motion since then.
     `previous_target_normal_cam` (3,) is the unit normal of the target (out of the paper) in its
     last pose, in the axes of the camera at that time.
     """
@@ -165,7 +168,8 @@ def merge_tracks(
 def widen_covariance_for_rival(merged: MergedTarget, rival_state: Array) -> MergedTarget:
     """Increase the target's covariance so that it also covers the position of a rival: a
     target-like pattern, with the state `rival_state` (8,), whose position contradicts the target's
-    track. If d is the difference between the two positions, the covariance grows by d d^T."""
+    track. If d is the difference between the two positions, the covariance grows by d d^T. The
+    variance of the yaw grows by the squared difference of the yaws."""
     off = rival_state[_XYZ_YAW_STATE_INDICES] - merged.track_frame_xyz_yaw
     off_m, off_rad = off[:3], wrap_rad(float(off[3]))
     return replace(
@@ -190,7 +194,10 @@ arise because the motion was measured one frame earlier."""
 
 
 def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detection]:
-    """Return the detections with their corners moved to where they were at the frame's time.
+    """Return the detections with their corners moved to where they were at the frame's time, when
+    the middle row was exposed. Each corner is moved back by its image velocity
+    (`Detections.flow_pxps`) times the delay of its row relative to the middle row. Markers without
+    a known image velocity stay unchanged.
 
     If the readout time `setup.readout_s` is None, the corners are not moved, and
     `corner_shift_per_readout_sigma_px` is their possible shift for a typical readout time.
@@ -240,8 +247,9 @@ def classify_visible_markers(is_large_detected: bool, is_small_detected: bool) -
 
 
 def make_marker_weight_matrix(weights: WeightsConfig) -> Array:
-    """Return the weight matrix W (4, 8) of the paper's equation 9. The columns are x of the large
-    and of the small marker, then y, z and yaw likewise."""
+    """Return the weight matrix W (4, 8) of the paper's equation 9, with one row for each of x, y, z
+    and yaw. The columns are x of the large and of the small marker, then y, z and yaw likewise. A
+    row contains the weight w of the large marker (`weights`) and 1 - w for the small one."""
     W = np.zeros((4, 8))
     for row, w in enumerate((weights.x, weights.y, weights.z, weights.yaw)):
         W[row, 2 * row : 2 * row + 2] = w, 1.0 - w
@@ -260,9 +268,9 @@ def merge_xyz_yaw(large: Array, small: Array, weights: WeightsConfig) -> Array:
 def are_marker_positions_inconsistent(
     large: MarkerPose, small: MarkerPose, max_position_difference_m: float
 ) -> bool:
-    """True if the positions from the two markers differ on any axis by more than
-    `max_position_difference_m` and by more than four standard deviations. Print errors shift both
-    markers alike, so they do not increase the tolerance."""
+    """True if the positions from the two markers differ on any axis of the level frame by more than
+    `max_position_difference_m` and by more than four standard deviations of the difference. Print
+    errors shift both markers alike, so they do not increase the tolerance."""
     gap = np.abs(large.e_m - small.e_m)
     variance = [
         np.maximum(p.sigma_m**2 - (p.shift_per_print_error_sigma_m**2).sum(axis=1), 0.0)

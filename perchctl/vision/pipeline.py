@@ -106,9 +106,10 @@ def make_pipeline(
     """Return the pipeline for a profile and a calibrated camera. Several image streams may share
     one pipeline.
 
-    `hidden_mask` (h, w) is True for pixels that the vehicle covers in the camera's images. If it is
-    None, the file `camera.mask` is read. Raises NotFound if this file is missing, and InvalidValue
-    if it is invalid.
+    `hidden_mask` (h, w) is True for pixels that the vehicle covers in the camera's images, and
+    replaces the mask in the file `camera.mask`. If it is None, this file is read. If the profile
+    names no file, no pixels are masked. Raises NotFound if the file is missing, and InvalidValue if
+    it is invalid.
     """
     pose_setup = PoseSetup(
         config=profile.pose,
@@ -169,8 +170,8 @@ def deinterlace(
     state: PipelineState, frame: Frame, pipeline: Pipeline
 ) -> tuple[PipelineState, tuple[Frame, ...]]:
     """Return the new state, and the frames to pass to `step` one by one: the frame itself, or its
-    two fields in time order if the camera is interlaced. Raises InvalidValue for the same reasons
-    as `step`."""
+    two fields in time order if the frame is interlaced and the order of its fields is known. Raises
+    InvalidValue for the same reasons as `step`."""
     with one_thread():
         frame = _convert_to_grey(frame, pipeline.camera)
         fields, found = deinterlace_frame(state.field_state, frame)
@@ -235,8 +236,10 @@ def _convert_to_grey(frame: Frame, camera: CameraModel) -> Frame:
 
 
 def _run_custom_detector(frame: Frame, detect: Detector) -> Detections:
-    """Run a custom detector and return its detections. Raises InvalidValue if it returns values
-    that cannot be corners."""
+    """Run a custom detector on the frame's grey image and return its detections. Without a standard
+    deviation from the detector, 0.5 px is assumed. A marker with a corner that is not finite is
+    omitted. Raises InvalidValue if the detector raises an exception or returns values that cannot
+    be corners."""
     found: dict[MarkerName, Detection] = {}
     try:
         for name, value in dict(detect(frame.image) or {}).items():
@@ -262,9 +265,9 @@ def step_detections(
     start_pose: PoseCandidate | None = None,
     picture_kind: PictureKind = "whole",
 ) -> tuple[PipelineState, PipelineOutput]:
-    """Run the part of `step` that follows detection. `start_pose` is the expected pose of the
-    target. `picture_kind` is passed on to the output: whether the image is a whole frame,
-    interlaced, or a field."""
+    """Run the part of `step` that follows detection: poses, tracks and target estimate.
+    `start_pose` is the target's expected pose in the camera frame; None if unknown. `picture_kind`
+    is passed on to the output: whether the image is a whole frame, interlaced, or a field."""
     last_pose, t_s = state.last_pose, detections.t_s
     normal = (
         target_normal_cam(last_pose.pose) if last_pose is not None and attitude is None else None
@@ -329,11 +332,13 @@ def estimate(
     pipeline: Pipeline,
 ) -> TargetEstimate | None:
     """Return the target estimate at `t_s`, a time after the newest frame, given the vehicle's
-    `attitude` at that time.
+    `attitude` and position at that time.
 
-    A tracked target is predicted with its filter and the vehicle's motion. A target that is no
-    longer tracked stays at its last position in the world. Returns None before the first
-    measurement.
+    If the filter works in the world frame, a tracked target is predicted with its filter.
+    Otherwise, or if the target is no longer tracked, it stays at its last position in the world,
+    and only the vehicle's motion changes its position relative to the gear. Returns None before the
+    first measurement. If the attitude is unknown, or was unknown when the last estimate was made,
+    that estimate is returned unchanged.
     """
     target = state.target
     if target is None or attitude is None or target.world_m is None:

@@ -36,9 +36,10 @@ _PoseSource = Literal["large", "small", "joint"]
 
 @dataclass(frozen=True, eq=False)
 class PoseSetup:
-    """Parameters of pose estimation. `T_body_cam` (4, 4) is the camera mounting, `gear_body_m` (3,)
-    the position of the gear's tip in body axes, and `readout_s` the rolling-shutter readout time
-    from the first to the last image row (None if unknown)."""
+    """Parameters of pose estimation. `T_body_cam` (4, 4) is the camera mounting, the pose of the
+    camera in body axes, `gear_body_m` (3,) the position of the gear's tip in body axes, and
+    `readout_s` the rolling-shutter readout time from the first to the last image row (None if
+    unknown)."""
 
     config: PoseConfig
     target: TargetConfig
@@ -90,11 +91,12 @@ def estimate_pose(
 ) -> MarkerPose | None:
     """Estimate the target's pose from the corners of one marker, or of both markers jointly.
 
-    A planar marker allows two tilts (pose ambiguity). If a `start` pose is given, its tilt is kept
-    and only refined. Otherwise the vehicle's roll and pitch resolve the ambiguity. Without an
-    attitude, the tilt with the normal closer to `previous_target_normal_cam` (3,) is chosen.
-    Returns None if the corners yield no pose, because there is no finite solution in front of the
-    camera, or because the reprojection error (RMS over the corners) is above
+    A planar marker allows two tilts (pose ambiguity). If a `start` pose is given, it is only
+    refined and keeps its tilt, unless the refinement fails or contradicts the expected tilt.
+    Otherwise the vehicle's roll and pitch resolve the ambiguity, because the target is horizontal.
+    Without an attitude, the tilt with the normal closer to `previous_target_normal_cam` (3,) is
+    chosen. Returns None if the corners yield no pose, because there is no finite solution in front
+    of the camera, or because the reprojection error (RMS over the corners) is above
     `pose.max_reprojection_px`.
     """
     source: _PoseSource = "joint" if len(detections) > 1 else detections[0].marker
@@ -144,8 +146,9 @@ def _refine_from_start(
     prior: TiltPrior,
     max_rms_reprojection_px: float,
 ) -> ScoredPose | None:
-    """Refine `start`; return None if the RMS reprojection error exceeds `max_rms_reprojection_px`
-    or if the tilt contradicts `prior`."""
+    """Refine the pose `start` to match the corners `points` (`refine_pose`). Returns None if there
+    is no start, if the refinement fails, if the RMS reprojection error exceeds
+    `max_rms_reprojection_px`, or if the tilt contradicts `prior`."""
     solution = None if start is None else refine_pose(points, start)
     if (
         solution is None
@@ -265,8 +268,8 @@ class PoseCandidate:
 
 @dataclass(frozen=True, eq=False)
 class ScoredPose(PoseCandidate):
-    """A pose candidate with its reprojection errors (n, 2), and their Jacobian (2n, 6) with respect
-    to rvec and tvec."""
+    """A pose candidate with its reprojection errors (n, 2), px, projected minus measured, and their
+    Jacobian (2n, 6) with respect to rvec and tvec."""
 
     reprojection_error_px: Array
     reprojection_jacobian: Array
@@ -298,7 +301,14 @@ class TiltPrior:
 
 def solve_pose(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
     """Return the more likely of the two possible poses of a planar marker; None if neither pose is
-    valid."""
+    finite and in front of the camera.
+
+    The poses come from a closed form (SQPNP) and, if the expected normal in `prior` is unknown or
+    contradicts them, from mirroring the tilt about the line of sight. The pose with the smallest
+    sum of squared errors is chosen: reprojection errors and the deviation from the expected normal,
+    each divided by its standard deviation. It is then refined by weighted least squares
+    (`refine_pose`).
+    """
     candidates = [_refine_unweighted(points, c) for c in _solve_closed_form(points)]
     scored = [_score_candidate(c, points) for c in candidates if _is_valid_candidate(c)]
     if not scored:
@@ -366,10 +376,12 @@ class PoseCovariance(NamedTuple):
 
 def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovariance:
     """Return the covariance of a pose, the chi-squared of its corners, and the effect of the
-    sheet's curl.
+    sheet's curl, from the weighted least-squares problem linearised at the pose.
 
-    The covariance includes corner noise (at least as large as the residuals), shifts common to all
-    corners, and a twist of the sheet, but not its bowl-shaped curl.
+    The covariance includes corner noise, scaled by how well the residuals agree with it, and shifts
+    common to several corners. If `points.allows_for_sheet_curl` is True, it also includes a twist
+    of the sheet, but never its bowl-shaped curl. Covariance and chi-squared are infinite if the
+    corners do not determine the pose.
     """
     W = points.whitening_matrix
     A, error = W.dot(scored.reprojection_jacobian), W.dot(scored.reprojection_error_px.ravel())
@@ -394,7 +406,8 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
 
 def _whitened_sheet_curl_shift(points: WeightedCorners, scored: ScoredPose) -> Array:
     """Return the shift (2n, 2) of the whitened reprojection errors for one standard deviation of
-    each mode of the sheet's curl."""
+    each mode of the sheet's curl. A corner that curl lifts off the sheet moves in the image as if
+    the target moved along its normal."""
     target_normal_cam = rotation_matrix(scored.rvec_rad)[:, 2]
     # If curl lifts a corner off the sheet's plane, its image moves as if the whole target moved
     # along its normal.
@@ -499,7 +512,8 @@ def corner_lift_by_sheet_curl(object_points_m: Array, sheet_curl_sigma_per_m: fl
 
 def sheet_curl_weight_matrix(whitened_shift_per_sheet_curl_sigma: Array) -> Array:
     """Return the weights ``(I + C C^T)^-1`` (2n, 2n) of whitened errors, where C is
-    `whitened_shift_per_sheet_curl_sigma` (2n, k), one column per mode."""
+    `whitened_shift_per_sheet_curl_sigma` (2n, k), one column per mode. The weights are the inverse
+    of the errors' covariance: unit noise plus the shifts due to curl."""
     inner = np.linalg.inv(
         np.eye(whitened_shift_per_sheet_curl_sigma.shape[1])
         + whitened_shift_per_sheet_curl_sigma.T @ whitened_shift_per_sheet_curl_sigma
@@ -581,9 +595,14 @@ def compute_corner_weights(
     K: Array,
     corner_lift_per_sheet_curl_sigma_m: Array,
 ) -> WeightedCorners:
-    """Return the corners of the detections with their weights. `image_points_px` are the corners in
-    a pinhole camera with matrix K; `corner_lift_per_sheet_curl_sigma_m` is the result of
-    `corner_lift_by_sheet_curl`."""
+    """Return the corners of the detections with their weights. The weights follow from how a
+    marker's corners were measured: from their covariance `cov_px2` if there is one, from the errors
+    of four fitted lines, or otherwise from independent errors with `sigma_px`.
+
+    `object_points_m` (n, 3) are the corners on the target, `image_points_px` (n, 2) the corners in
+    a pinhole camera with matrix K. `corner_lift_per_sheet_curl_sigma_m` is the result of
+    `corner_lift_by_sheet_curl`.
+    """
     n, m = len(image_points_px), len(detections)
     W, error_shifts = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
     corners_px = image_points_px.reshape(m, 4, 2)
@@ -635,7 +654,8 @@ def compute_corner_weights(
 
 
 def _outward_normals(corners: Array) -> Array:
-    """Return the outward unit normals (m, 4, 2) of the sides of m squares."""
+    """Return the outward unit normals (m, 4, 2) of the sides of m squares with `corners` (m, 4, 2),
+    in either order. Side k runs from corner k to corner k + 1."""
     side = corners.take(_SIDE_END_CORNER_INDICES, axis=1) - corners
     x, y = side[..., 0], side[..., 1]
     length = np.maximum(np.hypot(x, y), 1e-9)
@@ -647,9 +667,9 @@ def _outward_normals(corners: Array) -> Array:
 
 
 def _side_sigma_px(detection: Detection, corners: Array) -> Array:
-    """Return the standard deviation of each side's position perpendicular to it, (4,) px. In an
-    image from a single field, it is larger for sides along the image rows because every second row
-    is interpolated."""
+    """Return the standard deviation of each side's position perpendicular to it, (4,) px, for a
+    detection with `corners` (4, 2) px. In an image from a single field, it is larger for sides
+    along the image rows because every second row is interpolated."""
     sides = corners.take(_SIDE_END_CORNER_INDICES, axis=0) - corners
     lying = np.abs(sides[:, 0]) / np.maximum(np.hypot(sides[:, 0], sides[:, 1]), 1e-9)
     rows = 0.5 * math.pi * np.abs(sides[:, 1])
@@ -666,7 +686,8 @@ def _line_whitening_elements(normals: Array, sigma_px: float | Array) -> Array:
     that are intersections of four fitted lines. Each line has independent errors of offset and
     tilt.
 
-    `normals` (4, 2) are the lines' unit normals; `sigma_px` is a scalar for all lines, or (4,).
+    `normals` (4, 2) are the lines' unit normals; `sigma_px` is the standard deviation of a line's
+    position at its two corners, a scalar for all lines, or (4,).
     """
     across = (normals.T / sigma_px).ravel()
     tilt = across * _TILT_TO_OFFSET_WHITENING_RATIO

@@ -57,8 +57,10 @@ def marker_to_own_target_distance_m(
     corners_px: Array,
 ) -> float:
     """Return the horizontal distance, m, of a marker with corners (4, 2) px from the position of
-    the vehicle's own target. The result is infinite if the distance exceeds
-    `own_target.max_distance_m`."""
+    the vehicle's own target, or from the gear if this position is unknown. The marker's position
+    follows from a pose estimated from its corners; if they yield no pose, the result is
+    `_ASSUMED_DISTANCE_WITHOUT_POSE_M`. If `attitude` is known, distances above
+    `own_target.max_distance_m` become infinite."""
     seen = Detection(marker, corners_px, _RAW_CORNER_SIGMA_PX, are_corners_fitted=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
     distance_m = (
@@ -74,7 +76,7 @@ def horizontal_distance_to_own_target_m(
     pose: MarkerPose, attitude: VehicleState | None, own_target: OwnTargetPosition, setup: PoseSetup
 ) -> float:
     """Return the horizontal distance, m, of a detected target from the position of the vehicle's
-    own target, or from the gear if this position is unknown."""
+    own target, or from the gear if this position or the vehicle's attitude is unknown."""
     if own_target.xy_world_m is None or attitude is None:
         return math.hypot(pose.e_m[0], pose.e_m[1])
     seen_m, _ = target_level_to_world(pose.e_m, pose.e_yaw_rad, attitude, setup)
@@ -140,8 +142,14 @@ def make_track_measurement(
     filter_setup: FilterSetup,
     setup: PoseSetup,
 ) -> TrackMeasurement:
-    """Convert a pose to a filter measurement in the world frame (if `is_in_world_frame`) or in the
-    level frame."""
+    """Convert a pose to a filter measurement of (yaw, x, y, z): in the world frame of the state
+    estimate (if `is_in_world_frame`), or relative to the gear in the level frame.
+
+    Its covariance R does not include the errors that are the same in every frame. The shifts due to
+    these errors, the biases of the vehicle's roll and pitch and of the print, are returned
+    separately. R is None, so that the R of the filter setup applies, if the pose has no finite
+    covariance or the filter uses fixed noise.
+    """
     z, lever_m = np.empty(4), pose.e_m  # an error of the vehicle's tilt rotates this lever arm
     z[0], z[1:] = pose.e_yaw_rad, pose.e_m
     if is_in_world_frame:
@@ -178,10 +186,10 @@ def gear_to_target_shift_per_bias_sigma_m(
     filter_setup: FilterSetup,
     setup: PoseSetup,
 ) -> Array:
-    """Return the change (3, 4) of the vector from the gear to the target, in level axes, for one
-    standard deviation of each bias. It is `target_world_shift_per_bias_sigma_m` (3, 4), the change
-    of the target's position in the world, minus the effect of the roll and pitch biases on the
-    gear."""
+    """Return the change (3, 4) of the vector from the gear to the target, m, in level axes, for one
+    standard deviation of each bias: the vehicle's roll and pitch, the print's size and curl. It is
+    `target_world_shift_per_bias_sigma_m` (3, 4), the change of the target's position in the world,
+    minus the effect of the roll and pitch biases on the gear."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     moved = attitude.R_world_level.T.dot(target_world_shift_per_bias_sigma_m)
     moved[:, TILTS] -= vector_jacobian_wrt_tilt(gear_level) * filter_setup.roll_pitch_bias_sigma_rad

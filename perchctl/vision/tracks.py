@@ -84,7 +84,14 @@ def update_tracks(
     is_in_world_frame: bool,
     setup: TrackSetup,
 ) -> TrackedFrame:
-    """Update the tracks with those poses of one frame that the gate accepts."""
+    """Update the tracks with those poses of one frame that the gate accepts. The gate judges the
+    frame's most certain pose (`judge_pose`); if it rejects this pose, the tracks are only predicted
+    to `t_s`.
+
+    If the gate restarts the tracks, or if they change between the world frame (`is_in_world_frame`)
+    and the level frame, they begin anew. A pose that does not continue a track is also rejected if
+    it shows another vehicle's target. If the gate is disabled, there is no lock and no rival.
+    """
     filter_setup = setup.select_filter(is_in_world_frame)
     measurements = {
         name: make_track_measurement(
@@ -242,7 +249,14 @@ def judge_pose(
 ) -> GateVerdict:
     """Decide whether a frame's pose belongs to the tracked target (`lock`), to a competing
     target-like pattern (`rival`), or to neither, in which case it starts a new rival. Lock and
-    rival are None if there is none. Without a lock, every pose is accepted."""
+    rival are None if there is none. Without a lock, every pose is accepted.
+
+    A pose belongs to a track if its squared Mahalanobis distance from the track's prediction is at
+    most `_MAX_ACCEPTED_INNOVATION_CHI2`, and to the likelier of two such tracks. A pose that fits
+    neither track is still accepted, and the track restarts, if the state estimate has jumped or the
+    previous pose was wrong. A rival's pose is accepted if the evidence for the rival is strong
+    enough to replace the target (`_is_rival_accepted`).
+    """
     lock, rival = drop_expired_lock_and_rival(lock, rival, frame_pose.t_s)
     if rival is not None and rival.is_in_world_frame != frame_pose.is_in_world_frame:
         rival = None
@@ -417,8 +431,9 @@ def _compute_innovation(
 def _is_clearly_consistent(
     track: MarkerTrack, frame_pose: FramePose, filter_setup: FilterSetup
 ) -> bool:
-    """True if the unmodelled errors of lens, print and latency alone explain the innovation, as in
-    most frames. This fast check then makes the full one unnecessary."""
+    """True if the unmodelled errors of lens, print and latency alone explain the difference between
+    the pose and the track's prediction, as in most frames. This fast check then makes the full one
+    unnecessary."""
     wanted = predict_track(track, frame_pose.t_s, filter_setup)
     residual = frame_pose.measurement.z - wanted.x[MEASURED]
     residual[0] = wrap_rad(float(residual[0]))
@@ -588,11 +603,14 @@ _MOTION_ERROR_SMOOTHING_FACTOR = 0.1
 def predict_corners(
     last_pose: LastPose | None, t_s: float, attitude: VehicleState | None, setup: PoseSetup
 ) -> tuple[dict[MarkerName, Array] | None, PoseCandidate | None]:
-    """Predict the corners of both markers, (4, 2) px, and the pose of the target at `t_s` from the
-    last pose and the vehicle's motion since then.
+    """Predict the corners of both markers, (4, 2) px, and the pose of the target in the camera
+    frame at `t_s` from the last pose and the vehicle's motion since then. The motion is the mean of
+    two estimates, from positions and from velocities, weighted by their recent errors
+    (`LastPose.motion_errors`).
 
-    Returns (None, last pose) if the vehicle's attitude at either time is unknown, and (None, None)
-    if there is no recent pose.
+    Returns (None, last pose) if the vehicle's attitude at either time is unknown, (None, predicted
+    pose) if the corners have no finite projection, and (None, None) if there is no recent pose or
+    the target is predicted to be behind the camera.
     """
     if last_pose is None or not 0.0 < t_s - last_pose.pose.t_s <= MAX_TRACK_GAP_S:
         return None, None
@@ -674,8 +692,10 @@ class _CameraDisplacements(NamedTuple):
 def _camera_displacements_m(
     previous: VehicleState, current: VehicleState, setup: PoseSetup
 ) -> _CameraDisplacements:
-    """Return the camera's displacement from the `previous` to the `current` vehicle state, computed
-    both from positions and from velocities."""
+    """Return the camera's displacement (3,), m, in world axes from the `previous` to the `current`
+    vehicle state, computed both from positions and from the mean of the two velocities. The
+    rotation of the vehicle moves the camera too and is part of both. If a velocity is unknown, both
+    results come from the positions."""
     turned_m = _vehicle_to_camera_world_m(current, setup) - _vehicle_to_camera_world_m(
         previous, setup
     )

@@ -58,7 +58,8 @@ class CameraModel:
 
     @property
     def calibration_key(self) -> tuple[tuple[int, int], str, bytes, bytes]:
-        """A hashable value that is the same for all cameras with the same calibration."""
+        """A hashable value that is the same for all cameras with the same calibration: image size,
+        distortion model, camera matrix and distortion coefficients."""
         K, dist = (np.asarray(each, np.float64).tobytes() for each in (self.K, self.dist))
         return self.size_px, self.model, K, dist
 
@@ -70,8 +71,9 @@ m. Larger: an error that no other check detects is accepted."""
 
 
 def check_camera_matrix(K: Array) -> None:
-    """Raise InvalidValue if the camera matrix (3, 3) has nonzero entries that perchctl does not
-    support."""
+    """Raise InvalidValue if the camera matrix does not have the form (fx, s, cx), (0, fy, cy), (0,
+    0, 1) with a skew s of at most `MAX_CAMERA_MATRIX_SKEW_PX`, for example because it is
+    transposed."""
     if K.shape != (3, 3):
         raise InvalidValue(f"the camera matrix must have the shape (3, 3), found {K.shape}")
     if (K[1:, 0] == 0.0).all() and K[2, 1] == 0.0 and K[2, 2] == 1.0:
@@ -117,7 +119,7 @@ class Frame:
 
 def to_grey(image: Any) -> NDArray[np.uint8]:
     """Convert a grey, BGR or BGRA array with 8 or 16 bits to a contiguous 8-bit grey image,
-    (height, width). Raises InvalidValue for anything else."""
+    (height, width). Of 16 bits, the upper 8 are kept. Raises InvalidValue for anything else."""
     if image is None:
         raise InvalidValue(
             "the picture is None: cv2.imread returns None if it cannot read a file as an image"
@@ -188,7 +190,8 @@ class EdgeShift:
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """The target's markers as detected in one frame."""
+    """The target's markers as detected in one frame: `large` and `small`, None if not detected, and
+    the image velocity of their corners since the previous detections, `flow_pxps`, px/s."""
 
     frame_index: int
     t_s: float
@@ -459,7 +462,9 @@ class FieldState:
 
 @dataclass(frozen=True, eq=False)
 class PipelineState:
-    """The complete state of the pipeline between frames; `PipelineState()` is the initial state."""
+    """The complete state of the pipeline between frames: tracks, lock and rival, the last poses,
+    detections and target estimate, and the interlacing of the images. `PipelineState()` is the
+    initial state."""
 
     tracks: dict[str, MarkerTrack] = field(default_factory=dict)
     # True if the tracks are in the world frame of the state estimate, False if in the level frame.
@@ -477,7 +482,9 @@ class PipelineState:
 
 @dataclass(frozen=True, eq=False)
 class PipelineOutput:
-    """Result of processing one frame, for the planner and the log."""
+    """Result of processing one frame, for the planner and the log: the detected markers, their
+    poses by source (``joint``, ``large``, ``small``), the target estimate (None if there is no
+    track), and why the frame's pose was rejected, if it was."""
 
     detections: Detections
     poses: dict[str, MarkerPose]

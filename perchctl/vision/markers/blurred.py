@@ -69,12 +69,14 @@ def find_expected_blurred(
     expected_corners_px: Mapping[MarkerName, Array],
     frame_counter_for_initial_blur: int | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
-    """Find blurred markers near their expected corners (4, 2) px. Return the first marker found, or
-    an empty dict if there is none.
+    """Find blurred markers near their expected corners (4, 2) px. Each marker is shifted to where
+    its drawing correlates best with the image, and then fitted (`align_marker`). Return the first
+    marker that the fit confirms, or an empty dict if there is none.
 
     The caller increments `frame_counter_for_initial_blur` with each frame. To save time, the fits
     start with a small blur if the counter is even and with a large blur if it is odd. If the
-    counter is None, both are tried in this frame."""
+    counter is None, both are tried in this frame.
+    """
     image, patterns = detector_input.image, detector_input.setup.patterns
     blurs_px = (
         _START_BLURS_PX
@@ -117,8 +119,10 @@ def find_blurred(detector_input: DetectorInput) -> dict[MarkerName, RefinedCorne
 def _rank_quads(
     image: NDArray[np.uint8], quads: Array, patterns: Mapping[MarkerName, MarkerPattern]
 ) -> list[tuple[MarkerName, Array]]:
-    """Return the quadrilaterals among `quads` (m, 4, 2) whose cells resemble a marker's, best first
-    and without duplicates. Their corners are in the same order as the marker's."""
+    """Return at most `_MAX_QUADS_TO_FIT` of the quadrilaterals `quads` (m, 4, 2) px: those whose
+    cells in the image have a correlation above `_MIN_QUAD_CORRELATION` with a marker's, best first
+    and without duplicates. Each is returned with the marker's name; its corners are in the same
+    order as the marker's."""
     quads = quads[side_lengths_px(quads).min(axis=1) >= MIN_MARKER_SIDE_PX]
     if len(quads) == 0:
         return []
@@ -148,7 +152,9 @@ def _align_by_correlation(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> Array:
     """Return the corners (4, 2) px, translated to the position at which the marker's ideal
-    black-and-white pattern (its drawing) correlates best with the image."""
+    black-and-white pattern (its drawing) correlates best with the image. The search covers 10 px or
+    half a side in each direction, whichever is larger. If the image leaves no room for a search,
+    the corners are returned unchanged."""
     side_px = mean_side_px(corners_px)
     scale = min(1.0, _MAX_TEMPLATE_PX / (2.0 * side_px))
     reach = max(_MAX_POSITION_ERROR_PX, _MAX_POSITION_ERROR_SIDES * side_px)
@@ -181,8 +187,10 @@ def _align_by_correlation(
 def _render_template(
     pattern: MarkerPattern, sample_points_half_sides: Array, side_px: float
 ) -> NDArray[np.float32]:
-    """Return the marker's drawing at `sample_points_half_sides` (n, n, 2), in half sides from the
-    marker's centre, blurred for a marker whose side is `side_px` in the image."""
+    """Return the whiteness (n, n), 0 to 1, of the marker's drawing at `sample_points_half_sides`
+    (n, n, 2), in half sides from the marker's centre, blurred for a marker whose side is `side_px`
+    in the image. Areas with unknown content, the centre of the large marker and the surroundings of
+    the paper, are grey."""
     n = len(pattern.drawing.cell_whiteness)
     cell = np.floor((sample_points_half_sides + 1.0) * 0.5 * n).astype(np.intp)
     inside = ((cell >= 0) & (cell < n)).all(axis=2)
@@ -280,7 +288,10 @@ def align_marker(
 def is_alignment_confirmed(
     alignment: DrawingAlignment, max_corner_sigma_sides: float = _MAX_ALIGNED_CORNER_SIGMA_SIDES
 ) -> bool:
-    """True if the image matches the fitted drawing and determines the corners accurately enough.
+    """True if the image matches the fitted drawing, and if the standard deviation of the corners is
+    below `max_corner_sigma_sides` side lengths. To match, the image must correlate with the drawing
+    and with its inner pattern, the contrast of the pattern must be similar to that of the border,
+    and no cell may deviate much from its grey in the drawing.
 
     If there is no marker, the correlation of the inner pattern stays below 0.72 at any plausible
     contrast; if there is one, it is above 0.95.
@@ -298,9 +309,10 @@ def is_alignment_confirmed(
 
 
 def excludes_other_codewords(alignment: DrawingAlignment) -> bool:
-    """True if flipping any single bit of the codeword would fit the image clearly worse. In tests,
-    `is_alignment_confirmed` wrongly accepted 36 markers with other codewords; each of these had a
-    `worst_cell_flip_fraction` above 0.5."""
+    """True if flipping any single bit of the codeword would fit the image clearly worse: no cell
+    looks much like the opposite colour (`worst_cell_flip_fraction`), and this measure is accurate
+    enough for every cell. In tests, `is_alignment_confirmed` wrongly accepted 36 markers with other
+    codewords; each of these had a `worst_cell_flip_fraction` above 0.5."""
     return (
         alignment.worst_cell_flip_fraction < _MAX_CELL_FLIP_FRACTION
         and alignment.largest_cell_flip_fraction_sigma < _MAX_CELL_FLIP_FRACTION_SIGMA

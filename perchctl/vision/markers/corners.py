@@ -58,8 +58,8 @@ def apply_homography(H: Array, points: Array) -> Array:
 
 
 def corners_jacobian_wrt_homography_increment(homography: Array) -> Array:
-    """Return the Jacobian (8, 8) of the marker's corners, projected by a homography (3, 3), with
-    respect to the `homography_increment` of `increment_homography`."""
+    """Return the Jacobian (8, 8) of the marker's corners (x0, y0, x1, y1, ...), projected by a
+    homography (3, 3), with respect to the `homography_increment` of `increment_homography`."""
     q = _CENTRED_SQUARE_HOMOGENEOUS.dot(homography.T)
     x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
     A = (homography[:2, :2] - x[:, :, None] * homography[2, :2]) / d

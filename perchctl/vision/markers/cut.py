@@ -92,8 +92,10 @@ def is_target_truncated(
     shape: tuple[int, ...],
     hidden_mask: HiddenMask | None = None,
 ) -> bool:
-    """True if every expected marker, with corners (4, 2) px, may be truncated by the image border
-    or hidden by the vehicle's gear."""
+    """True if every expected marker, with corners (4, 2) px, may be truncated by the border of an
+    image with the given `shape` (h, w), because a corner is outside the image or less than
+    `_UNCERTAIN_TRUNCATION_MARGIN_PX` from its border, or is partly hidden by the vehicle's gear.
+    False if no marker is expected."""
     whole = [
         corners
         for corners in expected_corners_px.values()
@@ -107,8 +109,9 @@ def is_target_truncated(
 def can_complete_marker_be_in_view(
     expected_corners_px: Mapping[MarkerName, Array], shape: tuple[int, ...]
 ) -> bool:
-    """True if at least one expected marker, with corners (4, 2) px, may be completely in the
-    image."""
+    """True if at least one expected marker, with corners (4, 2) px, may be completely in an image
+    with the given `shape` (h, w): because predictions are uncertain, its corners may be up to
+    `_UNCERTAIN_TRUNCATION_MARGIN_PX` outside the image."""
     return any(
         is_inside_image(corners, shape, -_UNCERTAIN_TRUNCATION_MARGIN_PX)
         for corners in expected_corners_px.values()
@@ -172,8 +175,9 @@ def fit_truncated_markers(
 def shows_enough_of_target(
     R_cam_marker: Array, t_cam_marker_m: Array, target: TargetConfig, camera: CameraModel
 ) -> bool:
-    """True if the visible part of the target is large enough for a measurement. The pose of the
-    large marker in the camera frame is given by `R_cam_marker` (3, 3) and `t_cam_marker_m` (3,)."""
+    """True if the visible part of the target is large enough for a measurement: if the fit of
+    `fit_truncated_markers` to an ideal image would be reliable. The pose of the large marker in the
+    camera frame is given by `R_cam_marker` (3, 3) and `t_cam_marker_m` (3,)."""
     patterns = _make_patterns(target)
     pose = RigidPose(R_cam_marker @ _R_MARKER_DRAWING, t_cam_marker_m / (target.large.side_m / 2.0))
     pose_fit = predict_fit_accuracy(pose, _make_target_outline(patterns), camera)
@@ -281,8 +285,9 @@ def _is_pose_fit_reliable(pose_fit: PoseFit) -> bool:
 def _project_marker_corners(
     pose_fit: PoseFit, side_to_large_side_ratio: float, camera: CameraModel
 ) -> RefinedCorners | None:
-    """Return the corners (4, 2) px of the marker whose side is `side_to_large_side_ratio` times the
-    large marker's; None if a corner is too far from the optical axis for the lens model."""
+    """Return the corners (4, 2) px, with their covariance, of the marker whose side is
+    `side_to_large_side_ratio` times the large marker's, projected from the fitted pose. Returns
+    None if a corner is behind the camera or too far from the optical axis for the lens model."""
     r = (
         np.column_stack([side_to_large_side_ratio * CENTRED_SQUARE, np.zeros(4)])
         @ pose_fit.pose.R_cam_drawing.T
@@ -360,7 +365,9 @@ class CoarseUndistortedImage:
 
 @lru_cache(maxsize=8)
 def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
-    """Return the lattice that covers the camera's field of view."""
+    """Return the lattice that covers the camera's field of view, up to
+    `_MAX_VIEW_RADIUS_NORMALISED` from the optical axis in x and y. Its spacing corresponds to about
+    `_LATTICE_COLUMNS` nodes across the image."""
     w, h = camera.size_px
     s = np.linspace(0.0, 1.0, _BORDER_POINTS_PER_IMAGE_SIDE)
     low, high = np.zeros_like(s), np.ones_like(s)
@@ -443,8 +450,10 @@ def render_drawing(
     lattice: CoarseLattice,
     margin_nodes: int = 0,
 ) -> FloatImage:
-    """Return the whiteness, 0 to 1, of the drawing projected by `H_normalised_drawing` (3, 3), at
-    the lattice's nodes and at `margin_nodes` additional nodes on each side."""
+    """Return the whiteness, 0 to 1, of the drawing at the lattice's nodes and at `margin_nodes`
+    additional nodes on each side. `H_normalised_drawing` (3, 3) maps the drawing's coordinates to
+    normalised image coordinates; `texture` is the drawing as an image. Beyond the texture,
+    everything is white."""
     step = lattice.node_spacing_normalised / _SAMPLES_PER_LATTICE_NODE_AND_AXIS
     start = (
         lattice.first_node_normalised
@@ -483,8 +492,10 @@ class DrawingMatch(NamedTuple):
 def correlate_drawing(
     H_normalised_drawing: Array, texture: DrawingTexture, coarse_image: CoarseUndistortedImage
 ) -> DrawingMatch:
-    """Compare the coarse image with the drawing projected by `H_normalised_drawing` (3, 3), after
-    fitting the brightness and the contrast of the drawing to the image."""
+    """Compare the coarse image with the drawing, which `H_normalised_drawing` (3, 3) maps to
+    normalised image coordinates, at the visible nodes on the paper. The brightness and the contrast
+    of the drawing, each with a gradient across the image, are first fitted to the image. Both
+    results are 0 if fewer than `_MIN_VISIBLE_PAPER_NODES` nodes are visible."""
     lattice = coarse_image.lattice
     rows, columns = np.nonzero(coarse_image.is_visible)
     at = lattice.first_node_normalised + lattice.node_spacing_normalised * np.stack(
@@ -554,8 +565,9 @@ class DrawingTexture(NamedTuple):
 def make_outline(
     drawing: MarkerDrawing, large_print_tolerance_cells: float, small_print_tolerance_cells: float
 ) -> TargetOutline:
-    """Return the edges of both markers as points. The tolerances are standard deviations of the
-    position of a printed edge, in cells."""
+    """Return the black-white edges of both markers as points. Edges of the large marker that may be
+    hidden by the small one are omitted. The tolerances are standard deviations of the position of a
+    printed edge, in cells of the marker."""
     hidden = _SMALL_MARKER_OCCLUSION_REACH_HALF_SIDES * drawing.small_to_large_side_ratio
     edges = [
         edge
@@ -605,7 +617,7 @@ def make_drawing_texture(drawing: MarkerDrawing) -> DrawingTexture:
 class _CellEdge(NamedTuple):
     """An edge between a black and a white cell: points (n, 2) along the edge, its unit normal from
     black to white, a key that is the same for all edges on one straight line, and the width of the
-    cell."""
+    cell. Lengths are in half sides of the large marker, from the target's centre."""
 
     points_half_sides: Array
     drawing_normal_to_white: tuple[float, float]
@@ -616,9 +628,9 @@ class _CellEdge(NamedTuple):
 def _iterate_cell_edges(
     cell_whiteness: Array, side_to_large_side_ratio: float, points_per_edge: int
 ) -> Iterator[_CellEdge]:
-    """Yield each edge between a black and a white cell of a marker with `cell_whiteness` (n, n),
-    sampled at `points_per_edge` points. The marker's side is `side_to_large_side_ratio` times the
-    large marker's."""
+    """Yield each edge between a black cell and a white cell, or the white paper, of a marker with
+    `cell_whiteness` (n, n), 1 = white, sampled at `points_per_edge` points. The marker's side is
+    `side_to_large_side_ratio` times the large marker's."""
     width = 2.0 * side_to_large_side_ratio / len(cell_whiteness)
     s = (
         _EDGE_END_MARGIN_CELLS
@@ -893,7 +905,12 @@ def _measure_edge_offsets(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return two values for each edge point: the distance (n,), px, of the edge in the image from
     its expected position along the point's normal, positive towards white; and whether an edge was
-    found (n,)."""
+    found (n,).
+
+    An edge is the windowed centroid of the grey gradient on a profile that extends
+    `profile_half_lengths_px` (n,) to both sides of the expected position. It counts as found if its
+    contrast is high enough.
+    """
     profile_half_lengths_px = np.maximum(profile_half_lengths_px, _MIN_PROFILE_REACH_PX)
     grey = sample_profiles(
         image,
@@ -920,9 +937,10 @@ def _solve_gauss_newton_step(
     is_edge_found: NDArray[np.bool_],
     pose_and_edge_shift_change_from_start: Array,
 ) -> _GaussNewtonStep | None:
-    """Return one Gauss-Newton step with robust weights; None if too few edges were found.
-    `edge_offset_to_white_px` (n,) is the result of `_measure_edge_offsets`. A prior pulls
-    `pose_and_edge_shift_change_from_start` (7,), the sum of the previous steps, towards zero."""
+    """Return one Gauss-Newton step with robust (Tukey) weights; None if too few edges were found.
+    `edge_offset_to_white_px` and `is_edge_found`, (n,), are the results of `_measure_edge_offsets`.
+    A prior pulls `pose_and_edge_shift_change_from_start` (7,), the sum of the previous steps,
+    towards zero."""
     J, weight = edge_points.normal_motion_jacobian, is_edge_found.astype(np.float64)
     variance, step = 1.0, np.zeros(7)
     for _ in range(4):

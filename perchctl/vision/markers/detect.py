@@ -422,8 +422,11 @@ def make_detection_prior(
     frames_without_markers: int | None = None,
     measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None = None,
 ) -> DetectionPrior:
-    """Return what is known about the target before the frame. The arguments are those of
-    `detect_markers`."""
+    """Return what is known about the target before its markers are detected in the frame: the
+    expected corners, predicted by the caller (`expected_corners_px`) or otherwise extrapolated from
+    the `previous` detections; the kinds of search to use; and, from the `previous` detections,
+    whether the target was seen recently or truncated, and how far white has grown over black. The
+    arguments are those of `detect_markers`."""
     expected_corners_px = (
         dict(expected_corners_px)
         if expected_corners_px
@@ -489,7 +492,9 @@ def _choose_search_mode(
 ) -> SearchMode:
     """Return the kind of search for this frame. If the previous frame showed a marker, the search
     is near the expected corners. Otherwise, to save time, the kinds of search alternate from frame
-    to frame. If `frames_without_markers` is None, all kinds are selected."""
+    to frame. If no target is expected, the whole image is searched. If `is_line_fit_enabled` is
+    False, it is always searched, and only for sharp markers. If `frames_without_markers` is None,
+    all kinds are selected."""
     if frames_without_markers is None:
         return "all"
     if not is_line_fit_enabled or (is_target_expected and frames_without_markers % 2):
@@ -614,7 +619,9 @@ def extrapolate_corners(previous: Detections | None, t_s: float) -> dict[MarkerN
 
 def add_marker_flow(current: Detections, previous: Detections | None) -> Detections:
     """Return `current` with the image velocity, px/s, of its markers' corners since the `previous`
-    detections."""
+    detections, by finite differences. If only one marker was detected both times, the other one
+    gets the mean velocity of its corners. No velocity is added if no marker was detected both times
+    or if `previous` is more than `_MAX_MARKER_FLOW_AGE_S` old."""
     if previous is None or not 0.0 < current.t_s - previous.t_s <= _MAX_MARKER_FLOW_AGE_S:
         return current
     flow: dict[MarkerName, Array] = {}
@@ -706,8 +713,8 @@ def refine_photometrically(
 
 def _initial_blur_sigma_px(corners: RefinedCorners | None) -> float:
     """Return the standard deviation of the initial blur, px, for a photometric fit. It is the blur
-    of the sides if lines were fitted to them; otherwise it is `_DEFAULT_INITIAL_BLUR_SIGMA_PX`,
-    which is also the upper limit."""
+    of the sides, minus the blur due to sampling, if lines were fitted to them; otherwise it is
+    `_DEFAULT_INITIAL_BLUR_SIGMA_PX`, which is also the upper limit."""
     if (
         corners is None
         or not corners.are_corners_fitted
@@ -878,8 +885,9 @@ _MAX_MOTION_BETWEEN_FIELDS_SIDES = 1.5  # corresponds to 1.9 m/s for the small m
 
 def average_field_detections(first: Detections, second: Detections) -> Detections:
     """Return the mean of the corners in two fields, which does not depend on the order of the
-    fields. If any marker was detected in both fields, markers detected in only one field are
-    omitted."""
+    fields. A marker that moved by more than 1.5 sides between the fields is not averaged. If any
+    marker can be averaged, markers that cannot are omitted. Otherwise, the detections in one field
+    are returned: the first if it shows a marker, else the second."""
     averaged: dict[MarkerName, Detection] = {}
     for name in MARKERS:
         one, other = first.get(name), second.get(name)

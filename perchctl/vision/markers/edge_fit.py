@@ -134,8 +134,8 @@ def sample_profiles(
 ) -> Floats:
     """Return the grey values (rows, n, steps + 1) along the profiles, interpolated bilinearly. Each
     profile extends from -profile_half_length_px to +profile_half_length_px (rows,) from its
-    `profile_centre_px` along its `profile_direction`. Outside the image, the border pixels are
-    repeated.
+    `profile_centre_px` (rows, n, 2) along its `profile_direction`, a unit vector (rows, n, 2).
+    Outside the image, the border pixels are repeated.
 
     The image is converted to float because OpenCV 5 interpolates float images at the exact
     position. For 8-bit images, OpenCV rounds positions to 1/32 px. The rounding error would be as
@@ -330,9 +330,9 @@ def _refine_lines_once(
 
 
 def _fit_lines(markers: MarkerSides, outer_edges: EdgeData) -> tuple[Array, Array]:
-    """Return two values for the lines fitted to the sides: the coefficients (4m, 3) in normalised
-    coordinates, nx, ny, c with n.x = c and |n| = 1; and the weighted RMS distance, px (4m,), of the
-    points from the lines."""
+    """Fit a line to the edge points of each side by weighted total least squares. Return two values
+    for the lines: the coefficients (4m, 3) in normalised coordinates, nx, ny, c with n.x = c and
+    |n| = 1; and the weighted RMS distance, px (4m,), of the points from the lines."""
     w = outer_edges.weight / np.maximum(outer_edges.weight.dot(_PROFILE_ONES), 1e-9)[:, None]
     x, y = outer_edges.points_normalised[..., 0], outer_edges.points_normalised[..., 1]
     cx, cy = (w * x).dot(_PROFILE_ONES), (w * y).dot(_PROFILE_ONES)
@@ -357,7 +357,7 @@ def _fit_lines(markers: MarkerSides, outer_edges: EdgeData) -> tuple[Array, Arra
 
 def _intersect_adjacent_sides(line_nx_ny_c: Array) -> Array:
     """Return the intersections (m, 4, 2) of side i - 1 and side i of each marker in normalised
-    coordinates. `line_nx_ny_c` (4m, 3) is the result of `_fit_lines`."""
+    coordinates; NaN for parallel sides. `line_nx_ny_c` (4m, 3) is the result of `_fit_lines`."""
     sides = line_nx_ny_c.reshape(-1, 4, 3)
     before = sides.take(PREVIOUS_CORNER, axis=1)
     ax, ay, ac = before[..., 0], before[..., 1], before[..., 2]
@@ -388,13 +388,15 @@ def _measure_edge_shift(
     rms_residual_px: Array,
     corners_normalised: Array,
 ) -> EdgeShift | None:
-    """Measure how far white has grown over black, px, from the width of a marker's black border.
-    `corners_normalised` (m, 4, 2) are the measured corners of the outer edges. Returns None if no
-    inner edges were sampled.
+    """Measure how far white has grown over black, px, from the width of the black border of the
+    marker with the widest cells. `line_nx_ny_c` (4m, 3) and `rms_residual_px` (4m,) are the results
+    of `_fit_lines`; `corners_normalised` (m, 4, 2) are the measured corners of the outer edges.
+    Returns None if no inner edges were sampled, and the prior alone if none of them is usable.
 
     A growth by d moves the border's outer edges inwards, and its inner edges outwards, by d. On a
     scale whose unit is the measured outer edge, an inner edge at r then appears at r + d (1 + r).
-    The function solves this equation for d.
+    The function solves this equation for d, after a correction for a curled sheet, and combines the
+    result with the prior.
     """
     if inner_edges is None:
         return None
@@ -453,7 +455,9 @@ def _side_bow_px(
     markers: MarkerSides, outer_edges: EdgeData, line_nx_ny_c: Array, rms_residual_px: Array
 ) -> float:
     """Return the bow of the sides of the marker with the widest cells: by how much, px, their ends
-    are further out than their middles. The result is 0 if the bow is not significant."""
+    are further out than their middles. A parabola is fitted to the distances of each side's edge
+    points from its line, and the bow is the mean over the four sides. The result is 0 if it is not
+    significant compared with the noise `rms_residual_px` (4m,)."""
     four = slice(4 * markers.widest_marker_index, 4 * markers.widest_marker_index + 4)
     away = (
         np.matmul(outer_edges.points_normalised[four], line_nx_ny_c[four, :2, None])[..., 0]
@@ -471,8 +475,8 @@ def _side_bow_px(
 
 
 def _line_normal_outward_signs(markers: MarkerSides, line_nx_ny_c: Array) -> Array:
-    """Return the direction (4m,) of each line's normal: +1 if it points out of its marker,
-    otherwise -1."""
+    """Return the direction (4m,) of each line's normal, the first two columns of `line_nx_ny_c`
+    (4m, 3): +1 if it points out of its marker, otherwise -1."""
     corners = markers.corners_normalised
     out = (corners - (_MEAN_OF_FOUR_WEIGHTS @ corners)[:, None]).reshape(-1, 2)
     return np.asarray(np.sign(line_nx_ny_c[:, 0] * out[:, 0] + line_nx_ny_c[:, 1] * out[:, 1]))
@@ -526,10 +530,12 @@ def _row_jitter_sigma_px(
 ) -> float:
     """Return the standard deviation of the corners, px, due to row jitter in analogue video; 0 if
     it is not significant. Jitter only moves vertical sides, so they scatter more than horizontal
-    ones.
+    ones. Its variance is the slope of a line fitted to the four variances as a function of the
+    squared x components of the normals.
 
     `side_normals_x` are the x components of the four sides' unit normals. `line_end_variances_px2`
-    are the variances at the ends of the lines fitted to the sides."""
+    are the variances at the ends of the lines fitted to the sides.
+    """
     upright = [x * x for x in side_normals_x]
     mean = sum(upright) / 4.0
     aspect = sum((each - mean) ** 2 for each in upright) / 4.0
@@ -604,8 +610,8 @@ class EdgeData:
 def prepare_marker_sides(
     raw_corners_px: Array, cells_along_border: Sequence[CellsAlongBorder], camera: CameraModel
 ) -> MarkerSides | None:
-    """Return the sides of markers with corners (m, 4, 2); None if one of them is not a
-    quadrilateral."""
+    """Return the sides of markers with corners (m, 4, 2) px; None if one of them is not a
+    quadrilateral or the lens model has no solution for a corner."""
     sides_px = side_lengths_px(raw_corners_px)
     cells = np.array([rim.cells_per_side for rim in cells_along_border], dtype=np.float64)
     corners = undistort_to_normalised(raw_corners_px.reshape(-1, 2), camera).reshape(
@@ -709,7 +715,8 @@ def find_neighbour_edges(
     neighbour_distance_px: Array,
 ) -> NeighbourEdges:
     """Return which parallel edges, one cell further in or out, blur into the measured edges.
-    `fractions_along_side` (rows, n) are the positions of the profiles as fractions of a side.
+    `fractions_along_side` (rows, n) are the positions of the profiles as fractions of a side;
+    `neighbour_distance_px` (rows,) is the width of a cell across the edge.
 
     The rows are the four outer edges of each marker in `cells_along_border`, then, if there are
     four more, the inner edges of the border of the marker with `cells_along_inner_edges`.
@@ -814,11 +821,15 @@ def locate_edges(
     the profile, px (rows, n); its weight (rows, n), 0 for outliers; and the standard deviation of
     the blur in each row, px (rows,).
 
+    An edge is the centroid of the grey gradient under a Gaussian window, first a wide one around
+    the middle of the profile and then a narrow one around the line fitted to all profiles of a row.
+
     Args:
         profile_greys: grey values (rows, n, steps + 1) along each profile, from
             -profile_half_length_px to +profile_half_length_px.
         profile_half_length_px, window_half_length_px: half length of the profiles and of the
             windows, (rows,).
+        neighbours: parallel edges whose blur moves the measured edges; this is corrected.
     """
     profiles = _EdgeProfiles(
         profile_greys, profile_half_length_px, window_half_length_px, neighbours
@@ -878,8 +889,10 @@ class _EdgeProfiles:
         )
 
     def locate_in_wide_window(self) -> tuple[Floats, NDArray[np.bool_]]:
-        """Locate the edge on each profile with a wide window around the middle of the profile.
-        Return the edge offsets, px (rows, n), and whether each profile is usable (rows, n)."""
+        """Locate the edge on each profile at the centroid of the grey gradient under a wide
+        Gaussian window around the middle of the profile. Return the edge offsets from the middle,
+        px (rows, n), and whether each profile is usable (rows, n): whether its gradient is strong
+        enough."""
         spread = self.u * (_WIDE_WINDOW_HALF_LENGTH_PER_WINDOW_SIGMA / self.near)[:, None]
         spread *= spread
         window = np.empty((*self.u.shape, 2), dtype=np.float32)
@@ -893,9 +906,11 @@ class _EdgeProfiles:
     def locate_in_narrow_window(
         self, line_offsets_px: Floats, blur_variance_px2: Floats
     ) -> tuple[Floats, NDArray[np.bool_], Floats]:
-        """Locate the edge on each profile again, with a narrow window around the side's line at
-        `line_offsets_px` (rows, n). Return the edge offsets, px (rows, n), whether each profile is
-        usable (rows, n), and the variance of the blur, px^2 (rows,)."""
+        """Locate the edge on each profile again, with a narrow Gaussian window around the side's
+        line at `line_offsets_px` (rows, n). `blur_variance_px2` (rows,), the previous estimate of
+        the blur, sets the width of the window. The centroid of the gradient is corrected for the
+        window and for neighbouring edges. Return the edge offsets, px (rows, n), whether each
+        profile is usable (rows, n), and the variance of the blur, px^2 (rows,)."""
         relative = self.u[:, None, :] - line_offsets_px[:, :, None]
         # The second moment under a Gaussian window w is m2 with 1/m2 = 1/blur^2 + 1/w^2.
         w2 = np.minimum(
@@ -957,8 +972,9 @@ def _fit_line_to_half_side_midmeans(
 def _fit_robust_line(
     edge_offsets_px: Floats, is_usable: NDArray[np.bool_], iterations: int
 ) -> tuple[Floats, Floats]:
-    """Fit a straight line to each side with Tukey's biweight. Return the line's offsets and the
-    weights, both (rows, n)."""
+    """Fit a straight line to the usable edge offsets of each side, px (rows, n), by least squares
+    with Tukey's biweight: starting at the median, the line is fitted `iterations` times. Return the
+    line's offsets and the weights, both (rows, n)."""
     line = median_per_row(edge_offsets_px, is_usable)[:, None]
     for _ in range(iterations):
         size = np.abs(edge_offsets_px - line)

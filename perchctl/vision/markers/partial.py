@@ -159,7 +159,8 @@ def _linearize_edges(
     visible_edges: VisibleEdges, edge_shift_prior: EdgeShift
 ) -> tuple[Array, Array, Array]:
     """Linearise the offsets of the edges, px, with respect to nine unknowns: the increment of the
-    homography (8) and the shift of all edges.
+    homography (8) and the shift of all edges (px, white over black). `edge_shift_prior` is the
+    expected shift and its standard deviation.
 
     Returns the derivatives (9, rows * n), and the normal matrix (9, 9) and the right-hand side (9,)
     of the normal equations for edges with a variance of 1 px^2.
@@ -203,9 +204,11 @@ def _make_refined_corners(
     pattern: MarkerPattern,
     camera: CameraModel,
 ) -> RefinedCorners | None:
-    """Return the marker's corners, projected by `H_pinhole_marker` (3, 3), with their covariance;
-    None if they are too uncertain. `residual_px` (rows, n) are the residuals of the edges after the
-    fit, and `normal_matrix` (9, 9) is the normal matrix of the last step."""
+    """Return the marker's corners, projected by `H_pinhole_marker` (3, 3), with their covariance.
+    `residual_px` (rows, n) are the residuals of the edges after the fit, and `normal_matrix` (9, 9)
+    is the normal matrix of the last step. Returns None if the blur fills a window, if the RMS
+    residual is above `_MAX_EDGE_FIT_RMS_RESIDUAL_PX`, or if the standard deviation of a corner is
+    above `_MAX_CORNER_SIGMA_SIDES` side lengths."""
     w = visible_edges.weight
     mass = w.sum(axis=1)
     used = mass > 0.0
@@ -423,8 +426,10 @@ class VisibleEdges:
 def find_visible_edges(
     detector_input: DetectorInput, H_pinhole_marker: Array, pattern: MarkerPattern
 ) -> VisibleEdges | None:
-    """Measure the visible edges of a marker; None if too few are visible. `H_pinhole_marker` (3, 3)
-    projects the marker's coordinates to pixels of a pinhole camera."""
+    """Measure the visible edges of a marker: its sides and, if its cells are large enough, the
+    inner edges of its border. `H_pinhole_marker` (3, 3) projects the marker's coordinates to pixels
+    of a pinhole camera. Returns None if fewer than `_MIN_VISIBLE_EDGES` edges are visible, or if
+    they have too little contrast."""
     camera, cells, corners = (
         detector_input.camera,
         pattern.cells_along_border.cells_per_side,
@@ -541,7 +546,13 @@ def _find_clean_profiles(
     profile_half_length_px: Array,
 ) -> tuple[NDArray[np.bool_], float] | None:
     """Return for each profile (rows, n) whether it shows a clean step from black to white, and
-    return the grey level of white paper. None if the contrast is too low."""
+    return the grey level of white paper. None if the contrast is too low.
+
+    Black and white are the medians, over the profiles with `is_unobstructed` (rows, n), of the
+    greys on either side of the middle, at 0.6 times `window_half_length_px` (rows,). A clean
+    profile has nearly these greys there. `profile_greys` (rows, n, steps + 1) run from the dark to
+    the bright side, from -profile_half_length_px to +profile_half_length_px (rows,).
+    """
     # At 0.6 times the half length of the window, the blur of the edge has faded and that of a
     # neighbouring edge has not begun.
     off = max(

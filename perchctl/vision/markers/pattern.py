@@ -87,7 +87,8 @@ def make_cells_along_border(
     bits: NDArray[np.uint8], print_tolerance_cells: float = 0.0
 ) -> CellsAlongBorder:
     """Return the cells inside the border of a marker with inner bits (n, n), 1 = white: the cells
-    whose blur may reach the edges of the border."""
+    whose blur may reach the edges of the border. `print_tolerance_cells` is the standard deviation
+    of a printed edge's position, in cells."""
     n = len(bits)
 
     def ring(depth: int) -> Array:
@@ -162,8 +163,10 @@ def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: Mar
 def has_mostly_matching_cells(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> bool:
-    """True if more than `MIN_MATCHING_CELL_FRACTION` of the cells in the image have the colour of
-    their cell in the pattern."""
+    """True if more than `MIN_MATCHING_CELL_FRACTION` of the cells of a marker with corners (4, 2)
+    px have the colour of their cell in the pattern: their mean grey is on the right side of the
+    middle between the medians of black and white. False if the contrast is below
+    `MIN_CONTRAST_GREY` or the marker is partly outside the image."""
     means = _mean_grey_per_cell(image, corners_px, pattern)
     if means is None:
         return False
@@ -186,7 +189,8 @@ def correlate_pattern_rotations(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> Array:
     """Return the correlation (4,) of the grey values in the cells with the pattern, for the four
-    rotations of the marker (corners (4, 2) rolled by 0 to 3); 0 if there is no contrast."""
+    rotations of the marker (corners (4, 2) px rolled by 0 to 3); 0 if there is no contrast or the
+    marker is partly outside the image."""
     grey = _read_sample_greys(image, corners_px, pattern)
     if grey is None:
         return np.zeros(4)
@@ -212,8 +216,8 @@ def _mean_grey_per_cell(
 def _read_sample_greys(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> Array | None:
-    """Return the grey values (k,) at the sample points; None if any of them is outside the
-    image."""
+    """Return the grey values (k,) of the pixels nearest to the pattern's sample points in a marker
+    with corners (4, 2) px; None if any of them is outside the image."""
     at = apply_homography(
         homography_from_centred_square(corners_px), pattern.sample_points_half_sides
     )
@@ -225,7 +229,8 @@ def _read_sample_greys(
 
 
 def _sample_blurred_drawing(drawing: MarkerDrawing, sample_points_half_sides: Array) -> Array:
-    """Return the whiteness of the drawing at the sample points after a blur of half a cell."""
+    """Return the whiteness (k,), 0 to 1, of the drawing at the sample points (k, 2) after a blur
+    with a standard deviation of half a cell. The small marker is not drawn."""
     n, fine = len(drawing.cell_whiteness), 8
     sharp_nodes = np.kron(
         np.pad(drawing.cell_whiteness, 2, constant_values=1.0), np.ones((fine, fine))
@@ -288,9 +293,10 @@ def _cell_coverage(
     cells_per_side: int,
     square_reach_half_sides: float,
 ) -> Array:
-    """Return the fraction of each node's interval (half the spacing to each side) that each cell
-    covers, (nodes, cells), along one axis. Nodes and cells are in half sides from the marker's
-    centre; the cells fill a square from -square_reach_half_sides to square_reach_half_sides."""
+    """Return the fraction of each node's interval that each cell covers, (nodes, cells), along one
+    axis. A node's interval extends `node_reach_half_sides` to each side of its position. The
+    `cells_per_side` cells fill the interval from -square_reach_half_sides to
+    square_reach_half_sides. Lengths are in half sides from the marker's centre."""
     edges = square_reach_half_sides * np.linspace(-1.0, 1.0, cells_per_side + 1)
     low, high = (
         node_positions_half_sides[:, None] - node_reach_half_sides,
@@ -301,8 +307,8 @@ def _cell_coverage(
 
 
 def _add_margin_nodes(node_positions_half_sides: Array, node_reach_half_sides: float) -> Array:
-    """Return the node positions along one axis after adding `BLUR_MARGIN_NODES` nodes at both
-    ends."""
+    """Return the node positions along one axis after adding `BLUR_MARGIN_NODES` nodes at both ends.
+    `node_reach_half_sides` is half the spacing of the nodes."""
     more = 2.0 * node_reach_half_sides * np.arange(1, BLUR_MARGIN_NODES + 1)
     return np.concatenate(
         [
@@ -317,11 +323,13 @@ def _add_margin_nodes(node_positions_half_sides: Array, node_reach_half_sides: f
 def render_whiteness_and_off_paper_fraction(
     drawing: MarkerDrawing, nodes_per_side: int
 ) -> tuple[NDArray[np.float32], ...]:
-    """Render the drawing at n by n nodes and at a margin of nodes around them.
+    """Render the drawing at n by n nodes (`nodes_per_side`) over the square that the photometric
+    fit compares with the image, and at a margin of `BLUR_MARGIN_NODES` nodes around them, without
+    blur.
 
-    The first array returned is the whiteness of each node, 0 to 1. If the paper ends inside the
-    square that is compared with the image, a second array contains the fraction of each node that
-    is beyond the paper.
+    The first array returned is the whiteness of each node, 0 to 1. If the drawing has a
+    `paper_reach_half_sides`, a second array contains the fraction of each node that is beyond the
+    paper.
     """
     node_reach_half_sides = drawing.photometric_fit_reach_half_sides / nodes_per_side
     node_positions_half_sides: Array = node_reach_half_sides * (
@@ -341,8 +349,9 @@ def render_whiteness_and_off_paper_fraction(
 
 @lru_cache(maxsize=64)
 def render_black_square(cells_per_side: int, nodes_per_side: int) -> NDArray[np.float32]:
-    """Return the whiteness of a black square, with the size of a marker that has `cells_per_side`
-    cells, at n by n nodes and at a margin of nodes around them."""
+    """Return the whiteness of a black square on white paper, with the size of a marker that has
+    `cells_per_side` cells, at n by n nodes (`nodes_per_side`) and at a margin of nodes around them,
+    as in `render_whiteness_and_off_paper_fraction`."""
     return render_whiteness_and_off_paper_fraction(
         MarkerDrawing(np.zeros((cells_per_side, cells_per_side))), nodes_per_side
     )[0]
@@ -351,9 +360,10 @@ def render_black_square(cells_per_side: int, nodes_per_side: int) -> NDArray[np.
 def render_cells(
     drawing: MarkerDrawing, node_positions_half_sides: Array, node_reach_half_sides: float
 ) -> NDArray[np.float32]:
-    """Return the whiteness at the nodes of a square grid with the coordinates
-    `node_positions_half_sides` along both axes, extended by `BLUR_MARGIN_NODES` nodes on all
-    sides."""
+    """Return the whiteness, 0 to 1, at the nodes of a square grid with the coordinates
+    `node_positions_half_sides` along both axes, extended by `BLUR_MARGIN_NODES` nodes on all sides.
+    It is the mean over each node's square, which extends `node_reach_half_sides`, half the spacing,
+    to each side. The surroundings of the marker are white."""
     wide = _add_margin_nodes(node_positions_half_sides, node_reach_half_sides)
     C = _cell_coverage(wide, node_reach_half_sides, len(drawing.cell_whiteness), 1.0)
     black = C @ (1.0 - drawing.cell_whiteness) @ C.T
@@ -374,8 +384,10 @@ def blurred_cell_coverage(
     node_reach_half_sides: float,
     blur_sigma_nodes: float,
 ) -> Array:
-    """Return the fraction (n, cells) of each node's width that each row of cells covers, after a
-    Gaussian blur with the standard deviation `blur_sigma_nodes`."""
+    """Return the fraction (n, cells) of each node's interval that each row of cells covers, along
+    one axis, after a Gaussian blur with the standard deviation `blur_sigma_nodes`, in node
+    spacings. The nodes are at `node_positions_half_sides` (n,); their intervals extend
+    `node_reach_half_sides` to each side."""
     wide = _cell_coverage(
         _add_margin_nodes(node_positions_half_sides, node_reach_half_sides),
         node_reach_half_sides,

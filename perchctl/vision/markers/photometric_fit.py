@@ -156,8 +156,9 @@ def align_drawing(
     camera: CameraModel,
     initial_blur_sigma_px: float = 1.0,
 ) -> DrawingAlignment | None:
-    """Fit the drawing to the image, starting at `start_corners_px` (4, 2) and
-    `initial_blur_sigma_px`.
+    """Fit the drawing to the image by Gauss-Newton iterations, starting at `start_corners_px` (4,
+    2) and `initial_blur_sigma_px`. The unknowns are the homography of the marker, the variance of
+    the blur, and the illumination that converts the drawing to grey values.
 
     Returns None if a part of the marker is outside the image, if the image does not resemble the
     drawing, or if the fit diverges.
@@ -274,8 +275,11 @@ def align_drawing(
 def _linearize_greys(
     grey: Array, rendered_drawing: RenderedDrawing, homography_increment_from_start: Array
 ) -> _NormalEquations | None:
-    """Linearise the fit and return its normal equations; None if there is no contrast.
-    `homography_increment_from_start` (8,) is the sum of the increments so far."""
+    """Linearise the fit to the image's grey values `grey` (n * n,) at the nodes, and return its
+    normal equations; None if there is no contrast. The illumination is first fitted in closed form;
+    the equations then cover the homography increment, the blur and the illumination together.
+    `homography_increment_from_start` (8,) is the sum of the increments so far, which a prior pulls
+    towards zero."""
     rows, products = rendered_drawing.illumination_basis
     A = products + 1e-6 * np.eye(len(products))
     A[BEND, BEND] += 1e-3 * len(grey)  # keeps the bend at zero unless it is visible
@@ -304,8 +308,9 @@ def _linearize_greys(
 
 
 def fit_correlation(grey: Array, grey_residual: Array) -> float:
-    """Return the correlation of grey values (k,) with their fitted values. `grey_residual` (k,) is
-    the difference between the two."""
+    """Return the correlation of grey values (k,) with their fitted values: the square root of the
+    explained fraction of their variance, 0 if none is explained. `grey_residual` (k,) is the
+    difference between the two."""
     spread = grey - grey.mean()
     explained = 1.0 - float((grey_residual**2).sum()) / max(float((spread**2).sum()), 1e-9)
     return math.sqrt(max(explained, 0.0))
@@ -322,8 +327,10 @@ def _measure_worst_cell_flip_fraction(
 
     Each cell's residual is projected onto the change that a flipped bit would cause: the blurred
     cell, minus the part that the unknowns of the fit can absorb. The projection is 0 for a cell as
-    drawn and 1 for a flipped cell. `nodes_per_independent_sample` is the result of
-    `_estimate_nodes_per_independent_sample`."""
+    drawn and 1 for a flipped cell. `inverse_normal_matrix` is the inverse of the normal matrix in
+    `equations`; `nodes_per_independent_sample` is the result of
+    `_estimate_nodes_per_independent_sample`.
+    """
     soft, noise, contrast_grey = (
         rendered_drawing.blurred_cell_coverage,
         equations.noise_variance_grey2,
@@ -345,8 +352,10 @@ def _measure_worst_cell_flip_fraction(
 def _measure_inner_pattern_match(
     drawing: RenderedDrawing, grey: Array, contrast_grey: float
 ) -> tuple[float, float]:
-    """Return the correlation and the contrast of the inner pattern in `grey` (n * n,). The contrast
-    is relative to `contrast_grey`, the contrast between black and white."""
+    """Return the correlation and the contrast of the inner pattern in `grey` (n * n,). The inner
+    pattern is what remains of the drawing, and of the image, after subtracting the best-fitting
+    plain black square. The contrast is relative to `contrast_grey`, the contrast between black and
+    white. Both are 0 if nothing remains."""
     rows, products = drawing.black_square_illumination_basis
     A = products + 1e-9 * np.eye(len(products))
     both = drawing.illumination_basis[0][GAIN], grey
@@ -387,8 +396,8 @@ def _largest_cell_grey_deviation(
 def _assign_nodes_to_cells(
     grid: SamplingGrid, cells_per_side: int
 ) -> tuple[NDArray[np.intp], Array]:
-    """Return the index of the cell that contains each node, and the number of nodes in each
-    cell."""
+    """Return the index (n * n,) of the cell, row by row, that contains each node, and the number of
+    nodes in each cell, at least 1. The index of nodes outside the marker is the number of cells."""
     x, y = (grid.node_uv1[:2] + 1.0) * 0.5 * cells_per_side
     inside = (x >= 0) & (x < cells_per_side) & (y >= 0) & (y < cells_per_side)
     own = y.astype(np.intp) * cells_per_side + x.astype(np.intp)
@@ -471,8 +480,9 @@ def distort_px(pinhole_px: Array, camera: CameraModel) -> Array:
 def lens_distortion_shift_px(
     grid: SamplingGrid, H_pinhole_marker: Array, camera: CameraModel
 ) -> Array:
-    """Return the shift of each node due to lens distortion, px (2, n * n), interpolated from a few
-    nodes."""
+    """Return the shift of each node due to lens distortion, distorted minus pinhole position, px
+    (2, n * n). `H_pinhole_marker` (3, 3) projects the marker to a pinhole camera. The shift is
+    computed at a few Chebyshev nodes and interpolated."""
     node_uv1, between = _make_chebyshev_nodes(grid)
     pin = project_nodes(H_pinhole_marker, node_uv1)
     shift = (distort_px(pin, camera) - pin).reshape(
@@ -501,8 +511,10 @@ def _extract_patch(
     H_pinhole_marker: Array,
     node_distortion_shift_px: Array,
 ) -> tuple[NDArray[np.float32], Array] | None:
-    """Return the part of the image that contains all nodes, and the position (2, 1) of the top-left
-    pixel of this part. None if a node is outside the image."""
+    """Return the part of the image that contains all nodes, with room for their motion during the
+    fit, and the position (2, 1) of the top-left pixel of this part. The nodes are projected by
+    `H_pinhole_marker` (3, 3) and shifted by `node_distortion_shift_px` (2, n * n). None if a node
+    is outside the image."""
     h, w = image.shape
     x, y = project_nodes(H_pinhole_marker, grid.node_uv1) + node_distortion_shift_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -586,7 +598,8 @@ class RenderedDrawing:
         """Basis of the drawing's grey values under any illumination, and the Gram matrix of its
         rows. The rows (7 or 8, n * n) are the black level and its slopes in x and y, the contrast
         (gain) and its slopes, and the bend of the tone curve. The eighth row, the grey beyond the
-        paper, only exists if the paper ends inside the square that is compared with the image."""
+        paper, only exists if the size of the paper is known
+        (`MarkerDrawing.paper_reach_half_sides`)."""
         u, v, one = self.grid.node_uv1
         (white, _), *others = self.blurred_whiteness_and_off_paper_fraction
         rows = [one, u, v, white, white * u, white * v, white * (1.0 - white)]
@@ -611,7 +624,8 @@ class RenderedDrawing:
 
     @cached_property
     def blurred_cell_coverage(self) -> Array:
-        """Fraction of each node's width that each row (or column) of cells covers, (n, cells)."""
+        """Fraction of each node's width that each row (or column) of cells covers, (n, cells),
+        along one axis and after the blur."""
         half_node = self.drawing.photometric_fit_reach_half_sides / self.grid.nodes_per_side
         return blurred_cell_coverage(
             self.drawing, self.grid.node_positions_half_sides, half_node, self.blur_sigma_nodes

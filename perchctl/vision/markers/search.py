@@ -220,7 +220,8 @@ def choose_markers(
     small_to_large_side_ratio: float,
     measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None = None,
 ) -> dict[MarkerName, Array]:
-    """Return at most one large and one small marker, corners (4, 2) px.
+    """Return at most one large and one small marker, corners (4, 2) px, from the `candidates` that
+    were decoded. The result is empty if it is not clear which candidate is the target's.
 
     A small marker with the right size and rotation in the centre of a large one confirms both
     markers. Markers at expected positions take precedence over a pair elsewhere. Among single
@@ -287,8 +288,9 @@ def _sort_by_own_target_distance(
 def _pair_markers(
     candidates: Mapping[MarkerName, list[Array]], small_to_large_side_ratio: float
 ) -> list[tuple[float, int, int]]:
-    """Return the pairs of a large and a small marker that form a target, best first. Each pair
-    consists of the nesting error, the index of the large marker, and the index of the small
+    """Return the pairs of a large and a small marker that form a target, best first, at most one
+    for each large marker. Each pair consists of the nesting error
+    (`nesting_error_to_tolerance_ratio`), the index of the large marker, and the index of the small
     marker."""
     large, small = candidates["large"], candidates["small"]
     pairs = [
