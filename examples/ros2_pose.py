@@ -4,10 +4,9 @@ It needs ROS 2 (Humble or later) with rclpy, geometry_msgs and tf2_ros, but not 
 
     python3 ros2_pose.py --ros-args -p host:=127.0.0.1 -p port:=9870
 
-For each picture with an accepted pose, it publishes a PoseWithCovarianceStamped on ``target_pose``
-and the transform to ``target``, both from the frame that `perchctl track --frame-id` names. The
-stamp is the time of exposure; for a recording, it is the time at which the pose arrives. The node
-warns once of datagrams that are not from perchctl, and ignores them.
+It publishes a PoseWithCovarianceStamped on ``target_pose`` and the transform to ``target``, both
+from the frame that `perchctl track --frame-id` names. The stamp is the time of exposure; for a
+recording, it is the time at which the pose arrives.
 """
 
 import json
@@ -32,51 +31,32 @@ class TargetPose(Node):
         port = self.declare_parameter("port", 9870).value
         self._poses = self.create_publisher(PoseWithCovarianceStamped, "target_pose", 10)
         self._transforms = TransformBroadcaster(self)
-        self._receiver, self._note, self._is_foreign_reported = receiver, "", False
+        self._receiver, self._note = receiver, ""
         try:
             receiver.bind((host, port))
         except (OSError, OverflowError) as error:  # OverflowError: a port above 65535
             sys.exit(
-                f"ros2_pose: cannot receive on {host}:{port}: {error}; if another program uses "
-                "this port, stop it, or choose another port with --ros-args -p port:=PORT here "
-                "and --udp HOST:PORT in perchctl track"
+                f"ros2_pose: cannot receive on {host}:{port}: {error}; choose another port with "
+                "--ros-args -p port:=PORT here and --udp HOST:PORT in perchctl track"
             )
         receiver.settimeout(TIMEOUT_S)
 
     def receive(self) -> None:
         """Wait for a datagram, at most `TIMEOUT_S`, and publish it."""
         try:
-            data, sender = self._receiver.recvfrom(65535)
+            record = json.loads(self._receiver.recv(65535))
+            pose, unix_s, note = record["pose"], record["unix_s"], str(record["note"])
+            if pose is not None:
+                self._publish(pose, unix_s)
         except TimeoutError:
             return
-        try:
-            record = json.loads(data)
-            note, pose, unix_s = str(record["note"]), record["pose"], record["unix_s"]
-            messages = None if pose is None else self._messages(pose, unix_s)
-        except Exception as error:  # a foreign datagram may contain anything
-            self._report_foreign(sender, error)
-            return
+        except Exception:  # a foreign datagram may contain anything
+            note = "ignoring datagrams that are not from perchctl track --udp"
         if note not in ("", self._note):
             self.get_logger().warning(note)
         self._note = note
-        if messages is not None:
-            message, transform = messages
-            self._poses.publish(message)
-            self._transforms.sendTransform(transform)
 
-    def _report_foreign(self, sender: Any, error: Exception) -> None:
-        """Warn of the first datagram that is not from perchctl."""
-        if not self._is_foreign_reported:
-            self.get_logger().warning(
-                "ignoring datagrams that are not from perchctl track --udp; the first is from "
-                f"{sender[0]}:{sender[1]} ({type(error).__name__}: {error})"
-            )
-        self._is_foreign_reported = True
-
-    def _messages(
-        self, pose: dict[str, Any], unix_s: float | None
-    ) -> tuple[PoseWithCovarianceStamped, TransformStamped]:
-        """Return the pose and the transform to publish."""
+    def _publish(self, pose: dict[str, Any], unix_s: float | None) -> None:
         now = self.get_clock().now()
         stamp = (now if unix_s is None else Time(nanoseconds=round(unix_s * 1e9))).to_msg()
         message, transform = PoseWithCovarianceStamped(), TransformStamped()
@@ -88,7 +68,8 @@ class TargetPose(Node):
         for rotation in (message.pose.pose.orientation, transform.transform.rotation):
             rotation.x, rotation.y, rotation.z, rotation.w = pose["quaternion_xyzw"]
         message.pose.covariance = pose["covariance"]
-        return message, transform
+        self._poses.publish(message)
+        self._transforms.sendTransform(transform)
 
 
 def main() -> None:

@@ -85,7 +85,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (["-p", "mine.yaml", "--part", "pivot", "--source", "video:no.mp4"], 20, ["no.mp4"]),
         (["-p", "mine.yaml", "--source", "camera:99"], 20, ["camera:99"]),
         (["-p", "mine.yaml", "--from", "no.jsonl"], 20, ["no.jsonl"]),
-        (["-p", "mine.yaml", "--from", "mine.yaml"], 30, ["mine.yaml", "line 1"]),
+        (["-p", "mine.yaml", "--from", "mine.yaml"], 30, ["mine.yaml", "a profile"]),
         (["-p", "mine.yaml", "--from", "."], 30, ["."]),
         (["-p", "crazyflie", "--write"], 30, ["shipped", "cp ", "-p my_"]),
         (["-p", "mine.yaml", "--board", "chessboard:9x6:25mm"], 2, ["--board"]),

@@ -107,7 +107,7 @@ def test_the_camera_of_another_vehicle_is_named(sim: SimProcess, relay: Relay) -
     stand = Stand(name="north", home_m=(0.0, 0.0), home_text="home", views={"east": (0.05, 0.0)})
     rows = rows_of(relay.uri, sim, stand, profile=expecting(0.6, 0.0))
     assert rows["target"].verdict is Verdict.FAIL
-    assert re.search(r"a target 0\.[56]\d m from its own", rows["target"].found)
+    assert re.search(r"a target 0\.[56]\d m from the vehicle's own", rows["target"].found)
     assert rows["target"].found.endswith(
         "from the vehicle's own target, as the camera of east would"
     )

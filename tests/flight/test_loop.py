@@ -279,7 +279,13 @@ def test_what_is_reported_all_the_same_still_counts(changes: dict[str, float]) -
             marks=pytest.mark.long,
         ),
         # Against the ceiling the camera is dark.
-        (Vehicle(lambda s: replace(s, position_m=HANGS)), NO_PICTURE, SafetyAbort, "hangs", 0.0),
+        (
+            Vehicle(lambda s: replace(s, position_m=HANGS)),
+            NO_PICTURE,
+            SafetyAbort,
+            "is hanging",
+            0.0,
+        ),
         (Vehicle(), Camera(size_px=(320, 240)), InvalidValue, "320x240.*64x48", 0.0),
         (Vehicle(), Camera(live=False, frames=1), NotFound, "ended before take-off", 0.0),
     ],

@@ -55,7 +55,7 @@ REACH = changed({"target.expected_xy_m": (0.3, 0.0), "target.expected_within_m":
     # Two vehicles in one room: the other one stands level, on the ground, two metres aside.
     (at(0.2, -0.5, 0.012), REACH, None),
     (at(3.0, -0.5, 0.012), MOCAP, None),  # nobody has said where the target hangs
-    (at(3.0, -0.5, 0.012), REACH, "target is expected 2.7 m from where.*another vehicle's"),
+    (at(3.0, -0.5, 0.012), REACH, "target is expected 2.7 m from the vehicle.*another vehicle's"),
     (at(math.nan, -0.5, 0.012), MOCAP, "x nan"),
 ])  # fmt: skip
 def test_a_place_that_is_none_is_named(

@@ -195,7 +195,7 @@ def test_a_foreign_datagram_is_reported_once_and_does_not_end_the_node(
     poses, transforms = published(node, port, *foreign, mine)
     assert (len(poses), len(transforms)) == (1, 1)
     (warning,) = node[0].warnings
-    assert "not from perchctl track --udp; the first is from 127.0.0.1:" in warning
+    assert "not from perchctl track --udp" in warning
 
 
 def test_a_port_in_use_is_one_sentence(node: tuple[Ros2, ModuleType], port: int) -> None:
