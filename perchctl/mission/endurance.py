@@ -98,7 +98,8 @@ def _time_until_landing_must_begin_s(c: Context) -> float:
 
 @dataclass(frozen=True)
 class HoverTimes:
-    """Predicted times that the vehicle can hover from now on, s."""
+    """Predicted times that the vehicle can hover from now on, s: until row `battery-low` lands it,
+    and until the voltage in hover falls below `safety.min_load_v`."""
 
     until_battery_low_s: float  # until row `battery-low` lands the vehicle
     until_min_load_v_s: float  # until the voltage in hover falls below `safety.min_load_v`
@@ -164,7 +165,8 @@ def predict_hover_times(
 
 @dataclass(frozen=True)
 class MissionDurations:
-    """Predicted times that parts of a mission take, s."""
+    """Predicted times, s, that the rest of this attempt, each further attempt and the landing
+    take."""
 
     remaining_attempt_duration_s: float  # the rest of this attempt
     retry_duration_s: float  # each further attempt

@@ -391,8 +391,9 @@ def _is_touchdown_overdue(c: Context) -> bool:
 
 
 def _compute_braking_roll_pitch_rad(c: Context) -> tuple[float, float]:
-    """Return roll and pitch, rad, that balance the wind and brake the lateral speed; both are 0
-    without a heading, or while the magnet may hold the vehicle.
+    """Return roll and pitch, rad, that balance the wind and brake the lateral speed; roll to the
+    right and pitch nose down are positive. Both are 0 without a heading, or while the magnet may
+    hold the vehicle.
 
     The lateral reading of the accelerometer is the air's force per mass w, m/s^2, because the
     thrust acts along the body's z axis. To balance this force, the thrust needs the lateral part

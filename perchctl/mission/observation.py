@@ -13,8 +13,9 @@ from perchctl.vision import TargetEstimate
 @dataclass(frozen=True)
 class CameraImuMismatch:
     """An error of latency or mounting that explains why the target seems to move: pictures that are
-    `camera_latency_error_s` later than assumed, or a camera rotated by `camera_yaw_error_rad` about
-    the vehicle's upward axis. The other value is 0."""
+    `camera_latency_error_s` later than assumed, or a camera rotated relative to the profile by
+    `camera_yaw_error_rad` about body z, positive counter-clockwise from above. The other value is
+    0."""
 
     camera_latency_error_s: float = 0.0
     camera_yaw_error_rad: float = 0.0
@@ -22,8 +23,8 @@ class CameraImuMismatch:
 
 @dataclass(frozen=True)
 class VisualInertialMotion:
-    """The vehicle's motion at `t_s` from pictures and accelerometer; pairs are (x, y) in world
-    axes."""
+    """The vehicle's motion at `t_s` from pictures and accelerometer: lateral velocity and bias of
+    the acceleration, both (x, y) in world axes, and climb rate, positive up (None if unknown)."""
 
     t_s: float
     velocity_world_xy_mps: tuple[float, float]
@@ -33,7 +34,9 @@ class VisualInertialMotion:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """The planner's input in one tick. Times are on the loop's clock; ages are in seconds."""
+    """The planner's input in one tick: the newest telemetry, the target estimate, problems of
+    camera, link and log, the operator's request, and the motion from the IMU. Times are on the
+    loop's clock; ages are in seconds."""
 
     t_s: float
     telemetry: Telemetry  #: newest sample; its age is `t_s - telemetry.t_s`

@@ -15,9 +15,9 @@ from perchctl.values import replace
 def observe(
     state: PlannerState, obs: Observation, profile: Profile, maneuver: Maneuver
 ) -> PlannerState:
-    """Return the state with its belief updated in `maneuver`. After a gap without ticks, the catch
-    of a falling vehicle is cancelled. After a jump of the estimate, the remembered positions move
-    with it."""
+    """Return the state with its belief updated by `obs`; `maneuver` is the one that the vehicle is
+    flying. After a gap without ticks, the catch of a falling vehicle is cancelled. After a jump of
+    the estimate, the remembered positions move with it."""
     if has_tick_gap(state.belief, obs, profile):
         # The setpoint of a catch is far above the vehicle; keeping it would make the vehicle press
         # against the ceiling.

@@ -14,8 +14,9 @@ from perchctl.errors import (
 
 
 class Phase(Enum):
-    """The seven phases of the published method, recovery, hover, landing, and the three final
-    phases."""
+    """A phase of the mission: the seven of the published method (`APPROACH`, `SEARCH`, `ESTIMATE`,
+    `ALIGN`, `ASCEND`, `PERCH`, `COMPLETE`), `RECOVER` after a failed attempt, `HOVER` below the
+    target, `LANDING`, and the final phases `PERCHED`, `LANDED` and `ABORTED`."""
 
     __hash__ = object.__hash__  # identity hash, for speed: each row of the table looks up phases
 
@@ -35,17 +36,18 @@ class Phase(Enum):
 
     @property
     def is_before_landing(self) -> bool:
-        """True until a landing begins."""
+        """True for all phases except LANDING and the final phases."""
         return self in PRE_LANDING_PHASES
 
     @property
     def is_before_contact(self) -> bool:
-        """True while flying, until a contact is proven."""
+        """True for all phases except COMPLETE, which begins with a proven contact, LANDING and the
+        final phases."""
         return self in PRE_CONTACT_PHASES
 
     @property
     def is_final(self) -> bool:
-        """True for the final phases."""
+        """True for PERCHED, LANDED and ABORTED."""
         return self in FINAL_PHASES
 
 
@@ -81,7 +83,9 @@ PUBLISHED_METHOD_PHASES = (
 
 
 class Severity(IntEnum):
-    """Severity of a transition. Once a flight has reached `LAND`, its severity never decreases."""
+    """Severity of a transition: `CONTINUE` (normal progress), `HOLD` (wait, or go back and align or
+    search again), `BACK_OFF` (end the attempt), `LAND`, or `STOP` (stop the motors at once). Once a
+    flight has reached `LAND`, its severity never decreases."""
 
     CONTINUE = 0
     HOLD = 1
@@ -96,7 +100,8 @@ class Severity(IntEnum):
 
 
 class Outcome(Enum):
-    """Why the flight ended; each outcome has one exit code."""
+    """Why the flight ended, for example `PERCHED`, `TARGET_NOT_FOUND` or `ENDED_BY_OPERATOR`. Each
+    outcome has one exit code."""
 
     PERCHED = "perched"
     HOVERED = "hovered"
@@ -125,9 +130,13 @@ _EXIT_CODES: dict[Outcome, int] = {
 
 
 class VehicleDiagnosis(Flag):
-    """What a transition asserts about the vehicle, in addition to its reason. The next phase starts
-    from this diagnosis. Code that needs such a fact tests the diagnosis, never the name of a
-    row."""
+    """What a transition asserts about the vehicle, in addition to its reason: for example
+    `BLOCKED_BY_OBSTACLE` (an obstacle is just above the vehicle) or `CAMERA_MOUNTING_WRONG`.
+    `NONE` asserts nothing; several flags can be combined.
+
+    A transition is a row of the mission's table (`Transition`). The next phase starts from the
+    row's diagnosis. Code that needs such a fact tests the diagnosis, never the name of a row.
+    """
 
     NONE = 0
     BLOCKED_BY_OBSTACLE = auto()
@@ -154,7 +163,8 @@ class VehicleDiagnosis(Flag):
 
 
 class OperatorRequest(IntEnum):
-    """The operator's request, which can only escalate: `LAND`, then `CUT_MOTORS`."""
+    """The operator's request, which can only escalate: from `NONE` to `LAND`, then to
+    `CUT_MOTORS`."""
 
     NONE = 0
     LAND = 1

@@ -23,7 +23,8 @@ TickRole = Literal["waiting", "redone", "flown", "failed"]
 
 
 class EventKind(Enum):
-    """The kind of an `Event`."""
+    """The kind of an `Event`: the mission entered a phase (`PHASE`), paused in its phase
+    (`HOLD`), or there is something else to note, such as a missing battery reading (`NOTE`)."""
 
     PHASE = "phase"  # the mission entered a phase
     HOLD = "hold"  # the vehicle is holding its position
@@ -32,7 +33,9 @@ class EventKind(Enum):
 
 @dataclass(frozen=True)
 class Event:
-    """An event of the flight, for its log and the displays."""
+    """An event of the flight, for its log and the displays: a time on the loop's clock, a kind, and
+    a reason in words. An example is the transition from ASCEND to RECOVER, with the name of the row
+    that caused it."""
 
     t_s: float
     kind: EventKind
@@ -115,7 +118,8 @@ class SentCommand:
 
 @dataclass(frozen=True)
 class ExternalPositionStatus:
-    """The external positions sent to the vehicle: number, rate, and the newest one with its age."""
+    """The external positions sent to the vehicle so far: number, rate in Hz, the newest one with
+    its age in seconds, and why none is sent now."""
 
     newest_position_age_s: float  # age of the newest position
     problem: str | None  # why none is sent now
@@ -126,7 +130,8 @@ class ExternalPositionStatus:
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """A `perchctl.vision.Frame` from the camera, without its picture."""
+    """A `perchctl.vision.Frame` from the camera, without its picture: index, times of exposure
+    (`t_s`) and arrival on the loop's clock, and a checksum of the picture."""
 
     index: int
     t_s: float
@@ -139,7 +144,8 @@ class FrameRecord:
 
 @dataclass(frozen=True)
 class TickInputs:
-    """The samples from the link and the frame from the camera in one tick."""
+    """The inputs of one tick: the telemetry samples from the link, the frame from the camera, and
+    whether its sightings are used as external positions."""
 
     samples: tuple[Telemetry, ...] = ()  # in the order of arrival
     late_samples: tuple[Telemetry, ...] = ()  # arrived while camera or vision blocked the loop
@@ -158,7 +164,7 @@ class TickInputs:
 class UnfilteredPose:
     """An unfiltered pose of the target: `t_s` and `e_m` of a `perchctl.vision.MarkerPose` (exposure
     time, and vector from the gear to the target in the level frame, m), and its `e_yaw_rad`, the
-    target's heading relative to the vehicle's."""
+    target's heading relative to the vehicle's, rad, positive counter-clockwise from above."""
 
     t_s: float
     gear_to_target_level_m: Array
@@ -234,7 +240,7 @@ class Tick:
 
     @property
     def target(self) -> TargetEstimate | None:
-        """The target estimate that the planner used."""
+        """The target estimate that the planner used; None before the first sighting."""
         return self.observation.target
 
     @property
@@ -258,7 +264,7 @@ class Tick:
 
     @property
     def external_positions(self) -> ExternalPositionStatus | None:
-        """The external positions; None with decks."""
+        """The external positions sent to the vehicle; None with decks."""
         return self.record.external_positions
 
 

@@ -47,8 +47,9 @@ def find_transition_diagnosis(transition_name: str) -> VehicleDiagnosis:
 
 @dataclass(frozen=True)
 class Touchdown:
-    """Downward speed at the touchdown, and the largest specific force during it. Samples come every
-    10 ms, so the true peak may be higher."""
+    """Downward speed just before the touchdown, m/s, at least 0, and the largest specific force
+    along the body's z axis during it, g. Samples come every 10 ms, so the true peak may be
+    higher."""
 
     speed_mps: float
     peak_g: float
@@ -67,9 +68,10 @@ class Touchdown:
 
 @dataclass(frozen=True)
 class CameraFindings:
-    """Latency, s, and rotation of the camera relative to the profile about body x, y and z,
-    degrees, each with one standard deviation. `advice` is a tuple of sentences; it is empty if the
-    profile fits, and for a simulated vehicle because its camera is not a real one."""
+    """Estimates of a flight's camera: its total latency, s, and the rotation of its mounting
+    relative to the profile about body x, y and z, degrees, each with one standard deviation.
+    `advice` is a tuple of sentences; it is empty if the profile fits, and for a simulated vehicle
+    because its camera is not a real one."""
 
     measured_latency_s: float
     latency_sigma_s: float
@@ -141,8 +143,9 @@ def _is_significant(difference: float, threshold: float, sigma: float) -> bool:
 
 @dataclass(frozen=True)
 class HoverReport:
-    """Time and RMS position errors of a hover below the target, as the camera measured them
-    (`HoverErrors`): x forward, y left, z up, and heading."""
+    """Duration of a hover below the target, its intended distance below the target, and its RMS
+    errors as the camera measured them (`HoverErrors`): x forward, y left and z up in the level
+    frame, m, and heading, rad."""
 
     duration_s: float
     hover_distance_below_target_m: float
@@ -169,7 +172,9 @@ class HoverReport:
 
 @dataclass(frozen=True)
 class FlightReport:
-    """How a flight ended, and its findings."""
+    """How a flight ended: its last phase, outcome and reason, the number of attempts, the duration,
+    the events, and findings about camera, contact, touchdown and hover. Each finding is None if it
+    is unknown or does not apply."""
 
     phase: Phase
     outcome: Outcome
@@ -245,7 +250,9 @@ class RestReport:
 
     @property
     def text(self) -> str:
-        """The rest state in words without a full stop, with the touchdown if it was hard."""
+        """The rest state in words without a full stop, with the touchdown if it was hard: for
+        example ``the vehicle is on the floor with its motors off; it touched down hard: 1.4 m/s,
+        3.2 g``."""
         if self.touchdown is None or not self.touchdown.is_hard:
             return self.state.value
         return f"{self.state.value}; it {self.touchdown.text}"

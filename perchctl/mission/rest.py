@@ -26,8 +26,9 @@ come off."""
 
 
 class RestState(Enum):
-    """Where a vehicle with its motors off rests: on the magnet, on the floor, held elsewhere, or
-    unknown. Each value is a phrase without a full stop."""
+    """Where a vehicle with its motors off rests: on the magnet, held elsewhere, on the floor, or
+    unknown; `END_UNCONFIRMED` if not even the end of the flight could be confirmed. Each value is a
+    phrase without a full stop."""
 
     HANGS = "the vehicle is hanging on the magnet with its motors off"
     HELD = "something holds the vehicle away from the target; the motors are off"

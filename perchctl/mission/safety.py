@@ -195,8 +195,9 @@ def divergence_reason(c: Context) -> str:
 
 def is_position_lost(c: Context) -> bool:
     """True if no position has arrived for `positioning.land_s`. Also true earlier if the estimate
-    is useless: after an impact or gust that no sighting has corrected, because of its variance, or
-    because sightings contradict it."""
+    is useless: after an impact or gust that no sighting has corrected; because sightings contradict
+    it; or, with the target as the position source, because the position is stale and the variance
+    of the estimated velocity too large."""
     b = c.belief
     if b.position_correction_age_s > c.profile.positioning.land_s or b.is_estimate_missing_gust:
         return True

@@ -85,7 +85,7 @@ def make_setpoint_at_vehicle(c: Context) -> PositionSetpoint:
 
 def body_world_xy_under_target(c: Context, yaw_rad: float) -> tuple[float, float]:
     """Return the world x and y (m) of the body at which its gear is below the target, for the
-    heading `yaw_rad`."""
+    heading `yaw_rad` of the vehicle. The target's position must be known."""
     target = c.belief.target.world_position_m
     assert target is not None
     gear = rot_z(yaw_rad) @ c.profile.vehicle.gear_body_m
@@ -93,8 +93,8 @@ def body_world_xy_under_target(c: Context, yaw_rad: float) -> tuple[float, float
 
 
 def make_setpoint_under_target(c: Context, vehicle_world_z_m: float) -> PositionSetpoint:
-    """Return the setpoint that brings the gear below the target: the body at height
-    `vehicle_world_z_m`, with the target's heading."""
+    """Return the setpoint that brings the gear below the target: the body's origin at world z
+    `vehicle_world_z_m`, with the target's heading. The target's position must be known."""
     yaw = c.belief.target.world_yaw_rad
     assert yaw is not None
     x, y = body_world_xy_under_target(c, yaw)
@@ -317,7 +317,8 @@ def lower_held_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpo
 
 def limit_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     """Return the setpoint moved inside the fence, below the height limit, and at least
-    `MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M` above the ground; in a take-off, at least at the ground."""
+    `MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M` above the ground; in a take-off, at least at the ground.
+    The setpoint is unchanged while the take-off position is unknown."""
     ground, safety = c.belief.takeoff_position_m, c.safety
     if ground is None:
         return setpoint

@@ -17,7 +17,9 @@ from perchctl.vehicle import EmergencyStop, PositionSetpoint, StopMotors
 
 @dataclass(frozen=True)
 class BatteryOutlook:
-    """Predicted remaining time and attempts; None means unknown."""
+    """How long the battery lasts: predicted hover time, s, until row `battery-low` would land the
+    vehicle; number of attempts that the battery allows; consumed charge, mAh; and resting voltage,
+    V. None means unknown."""
 
     hover_time_left_s: float | None = None  # hover time until `battery-low` would land the vehicle
     # attempts that the battery allows, with the landing after the last one; None before the first
@@ -29,7 +31,9 @@ class BatteryOutlook:
 
 @dataclass(frozen=True)
 class LevelDescentState:
-    """State of a descent by raw thrust; thrusts are 0..65535, and 0 before it has begun."""
+    """State of a descent by raw thrust: the last commanded thrust, 0..65535 (0 before the descent),
+    the climb rate, positive up, that recent commands cause but no sample shows yet, and when the
+    floor was detected (None before)."""
 
     last_commanded_raw_thrust: float = 0.0
     climb_rate_measured_at_s: float = -math.inf  # time of the newest sample at the last tick
@@ -87,7 +91,8 @@ class HoverErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class PhaseEntry:
-    """How the present phase was entered."""
+    """How the present phase was entered: time on the loop's clock, the vehicle's estimated position
+    and heading in the world, and name, reason and diagnosis of the transition."""
 
     t_s: float = 0.0
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # estimated position of the vehicle
@@ -100,7 +105,10 @@ class PhaseEntry:
 
 @dataclass(frozen=True, eq=False)
 class PlannerState:
-    """The planner's whole state. Times are on the loop's clock."""
+    """The planner's whole state between two ticks: its belief, the present phase and how it was
+    entered, the setpoint and last commands, the number of failed attempts, and the outcome (None
+    until one is decided). Times are on the loop's clock; positions are in the world frame of the
+    state estimate."""
 
     belief: Belief
     phase: Phase = Phase.APPROACH
@@ -159,7 +167,8 @@ class PlannerState:
         return self.weight_transfer_began_at_s is None and self.motor_stop_commanded_at_s is None
 
     def command_history(self, maneuver: Maneuver) -> CommandHistory:
-        """Return the commands sent so far, in the form that the belief uses."""
+        """Return the commands sent so far, in the form that the belief uses; `maneuver` is that of
+        the present phase."""
         return CommandHistory(
             maneuver=maneuver,
             maneuver_start_position_m=self.entry.position_m,

@@ -136,7 +136,7 @@ def add_rows(
 
 
 def _check_types(row: object) -> None:
-    """Raise InvalidValue for an object that is not a valid `Transition`."""
+    """Raise InvalidValue unless `row` is a `Transition` whose fields have the right types."""
     if not (
         isinstance(row, Transition)
         and isinstance(row.phases, Set)

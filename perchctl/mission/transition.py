@@ -39,11 +39,12 @@ class Transition:
         return self.to is phase and self.severity is Severity.HOLD
 
     def reason_text(self, c: Context) -> str:
-        """Return the reason in words."""
+        """Return the reason in words; a `reason` that is a function is called with `c`."""
         return self.reason if isinstance(self.reason, str) else self.reason(c)
 
     def outcome_after(self, previous_outcome: Outcome | None) -> Outcome | None:
-        """Return the flight's outcome after this transition."""
+        """Return the flight's outcome after this transition: `previous_outcome` if the row has no
+        outcome of its own. None means that no outcome has been decided."""
         if self.outcome is None or isinstance(self.outcome, Outcome):
             return self.outcome or previous_outcome
         return self.outcome(previous_outcome)
@@ -52,14 +53,16 @@ class Transition:
 def motor_cut_row(
     name: str, when: Predicate, reason: str, outcome: Outcome = Outcome.SAFETY
 ) -> Transition:
-    """Return a row that stops the motors at once in any airborne phase and locks the vehicle: the
-    firmware then refuses to fly until it is restarted."""
+    """Return a row that stops the motors in any airborne phase as soon as `when` is true, and locks
+    the vehicle: the firmware then refuses to fly until it is restarted. The other arguments are the
+    fields of `Transition`."""
     return _abort_row(name, when, reason, outcome, EmergencyStop())
 
 
 def supervisor_abort_row(name: str, supervisor_bit: int, reason: str) -> Transition:
-    """Return a row that stops the motors and aborts once the supervisor has set
-    `supervisor_bit`."""
+    """Return a row called `name` that stops the motors and aborts once the firmware's supervisor
+    has set `supervisor_bit`, a bit mask such as `perchctl.vehicle.TUMBLED`. `reason` is shown to
+    the user."""
 
     def when(c: Context) -> bool:
         return c.telemetry.has_bit(supervisor_bit)
@@ -120,7 +123,8 @@ def abort_during_landing_row(
     name: str, when: Predicate, reason: Reason, diagnosis: VehicleDiagnosis = VehicleDiagnosis.NONE
 ) -> Transition:
     """Return a row from LANDING to ABORTED, where the motors are stopped, for a landing that could
-    not be completed normally."""
+    not be completed normally: it applies once `when` is true. The other arguments are the fields of
+    `Transition`."""
     return Transition(
         name,
         {Phase.LANDING},

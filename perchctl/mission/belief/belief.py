@@ -69,9 +69,11 @@ class GearToTargetDistance:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Belief:
-    """The belief about vehicle and target, together with the evidence for it.
+    """The belief about vehicle and target, together with the evidence for it: reliability of the
+    state estimate, dead reckoning, target, contact, hover thrust and battery.
 
-    Times are on the loop's clock. A time is None until the event has happened.
+    Times are on the loop's clock. A time is None until the event has happened. Positions and
+    velocities are in the world frame of the state estimate.
     """
 
     obs: Observation  #: newest observation, on which all properties depend
@@ -404,7 +406,7 @@ class Belief:
 
     @cached_property
     def speed_mps(self) -> float:
-        """Magnitude of the estimated velocity, m/s."""
+        """Magnitude of `velocity_mps`, all three axes, m/s."""
         return math.sqrt(sum(v * v for v in self.velocity_mps))
 
     @cached_property

@@ -572,7 +572,8 @@ SUPPORT_CONDITIONS = (
 
 
 class Support(Enum):
-    """What supports the vehicle."""
+    """What supports the vehicle: the air, a surface that it presses against, the target's magnet,
+    another object, the floor, or unknown."""
 
     AIR = "nothing: the vehicle is flying"
     PRESSED_SURFACE = "the target or an obstacle that the vehicle is pressing against"

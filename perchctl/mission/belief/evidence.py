@@ -16,8 +16,8 @@ ConditionInput = TypeVar("ConditionInput", contravariant=True)
 
 
 class RequiredData(Enum):
-    """Data that a condition requires. The condition does not count while that data is old or
-    unknown."""
+    """Data that a condition requires: nothing, fresh telemetry, or fresh telemetry and a valid
+    position. The condition does not count while that data is old or unknown."""
 
     NOTHING = "no data that could be out of date"
     TELEMETRY = "fresh telemetry"
@@ -26,7 +26,7 @@ class RequiredData(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Condition(Generic[ConditionInput]):
-    """A condition on the belief or the context, evaluated once per tick.
+    """A condition on the belief or the context, evaluated once per tick: for example `ON_FLOOR`.
 
     Attributes:
         name: readable name, for `repr`.

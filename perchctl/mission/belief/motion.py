@@ -164,7 +164,9 @@ class FusionAge:
 
 @dataclass(frozen=True)
 class Impact:
-    """An impact on the vehicle from below, for example at a touchdown."""
+    """An impact on the vehicle from below, for example at a touchdown: its time (-inf if there was
+    none), the climb rates just before it (positive up), the largest specific force along the body's
+    z axis, g, and the height, world z."""
 
     t_s: float = -math.inf  # -inf: no impact yet
     # vertical speed just before the impact, from the state estimate
@@ -180,8 +182,9 @@ class Impact:
 
 @dataclass(frozen=True)
 class FreezeDetector:
-    """Detector of frozen readings: the times for which they have not changed. In the air, two
-    successive readings are never identical."""
+    """Detector of frozen readings: the times, s, for which the accelerometer, the attitude, and
+    position and velocity have not changed. In the air, two successive readings are never
+    identical."""
 
     # time for which the accelerometer readings have been identical
     acceleration_frozen_for_s: float = 0.0
@@ -246,8 +249,9 @@ class FallDetector:
     def update_fall(
         self, t_s: float, up_acceleration_mps2: float, acc_z_g: float, dt_s: float
     ) -> Self:
-        """Return the detector after `dt_s` of vertical acceleration `up_acceleration_mps2`;
-        `acc_z_g` is the specific force along the body's z axis at the end of that time."""
+        """Return the detector at `t_s`, after `dt_s` of vertical acceleration
+        `up_acceleration_mps2` (world z, without gravity). `acc_z_g` is the specific force along the
+        body's z axis at `t_s`."""
         offset = self.up_acceleration_offset_mps2 + (
             max(
                 MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G * GRAVITY_MPS2,
@@ -295,9 +299,9 @@ class ImpactDetector:
     def update_impact(
         self, newest_sample: Impact, world_z_m: float, up_acceleration_mps2: float, dt_s: float
     ) -> Self:
-        """Return the detector after `dt_s` of vertical acceleration `up_acceleration_mps2`.
-        `newest_sample` holds time, speeds and specific force of the new sample, and `world_z_m` is
-        its estimated height."""
+        """Return the detector after `dt_s` of vertical acceleration `up_acceleration_mps2` (world
+        z, without gravity). `newest_sample` holds time, climb rates and specific force of the new
+        sample, and `world_z_m` is its estimated height."""
         upward_speed_gained_mps = max(
             0.0,
             self.upward_speed_gained_mps
@@ -466,8 +470,9 @@ class LateralPushDetector:
 class ImuMotion(
     FreezeDetector, FallDetector, ImpactDetector, SteadySpeedDetector, LateralPushDetector
 ):
-    """The vehicle's motion from accelerometer and attitude alone; a time of -inf means that the
-    event has not happened."""
+    """The vehicle's motion from accelerometer and attitude alone: velocity gained since the first
+    sample (world axes), falls, impacts, lateral pushes and telemetry gaps. A time of -inf means
+    that the event has not happened."""
 
     t_s: float = -math.inf  # time of the newest sample
     # velocity gained since the first sample, world axes
@@ -617,9 +622,10 @@ def _can_exclude_fall(last: Telemetry, new: Telemetry, height_change_in_gap_m: f
 def _integrate_acceleration(
     motion: ImuMotion, last: Telemetry, new: Telemetry, dt_s: float
 ) -> tuple[ImuMotion, float]:
-    """Return the motion with its velocity integrated by the trapezoid rule, and the mean vertical
-    acceleration between the two samples, m/s^2. The accelerometer's offsets are learned while the
-    motors are off and the vehicle does not fly."""
+    """Return the motion with its velocity integrated by the trapezoid rule from `last` to `new`,
+    `dt_s` later, and the mean vertical acceleration between the two samples, m/s^2 (world z,
+    without gravity). The accelerometer's offsets are learned while the motors are off and the
+    vehicle does not fly."""
     accelerometer_offset_g = motion.accelerometer_offset_g
     if new.thrust < 1 and not new.has_bit(FLYING):
         accelerometer_offset_g = _filter_accelerometer_offset(
@@ -645,7 +651,8 @@ def _integrate_acceleration(
 
 
 class TiltError(NamedTuple):
-    """Error of the estimated roll and pitch, and the body's true rates about both axes."""
+    """Error of the estimated roll and pitch (estimated minus true), rad, and the body's true rates
+    about both axes, rad/s."""
 
     roll_pitch_error_rad: tuple[float, float]
     body_roll_pitch_rate_radps: tuple[float, float]
@@ -654,7 +661,7 @@ class TiltError(NamedTuple):
 def _estimate_tilt_error(
     motion: ImuMotion, last: Telemetry, new: Telemetry, dt_s: float
 ) -> TiltError:
-    """Return the error of the estimated roll and pitch after one more sample.
+    """Return the error of the estimated roll and pitch after the sample `new`, `dt_s` after `last`.
 
     If the lateral velocity steps within one sample, the estimate has been corrected, and its
     attitude with it. The rotation in that sample that the previous body rates do not explain is

@@ -53,7 +53,8 @@ _MAX_TARGET_JUMP_DURATION_S = max(within_s for _, within_s in TARGET_JUMPS)
 
 @dataclass(frozen=True)
 class CameraMountingSample:
-    """Positions of vehicle and target at `t_s` in the world, as x + iy in m.
+    """Horizontal positions of vehicle and target at `t_s` in the world frame of the state estimate,
+    as x + iy in m.
 
     `vehicle_to_up_axis_at_target_height_world_xy_m` is the vector from the vehicle to the point
     where its upward axis meets the target's plane.

@@ -41,7 +41,8 @@ def _is_tilt_too_large(b: Belief) -> bool:
 
 
 def _is_battery_low(b: Belief) -> bool:
-    """True if the firmware reports low power, or if the measured voltage is below `min_load_v`."""
+    """True if the firmware reports low power, or if the measured voltage is below
+    `safety.min_load_v`. A missing voltage does not count as low."""
     tel = b.telemetry
     known = tel.battery_v >= NO_BATTERY_READING_V
     low = known and tel.battery_v < b.profile.safety.min_load_v
@@ -90,8 +91,8 @@ def hold_reason(b: Belief, maneuver: Maneuver) -> str:
     string.
 
     In free air, the reason is a stale position. In a maneuver guided by the camera, it is also old
-    telemetry, a jump or an excessive variance of the state estimate, a late control loop or, if the
-    maneuver requires pictures, an old picture.
+    telemetry, a jump of the state estimate, an excessive variance of its velocity or position, a
+    late control loop or, if the maneuver requires pictures, an old picture.
     """
     safety = b.profile.safety
     if maneuver.is_in_free_air and b.is_position_stale:
@@ -112,7 +113,9 @@ def hold_reason(b: Belief, maneuver: Maneuver) -> str:
 
 
 def position_loss_text(b: Belief) -> str:
-    """Return a text that says how long no external position has been sent, and why."""
+    """Return a text that says for how long no external position has been sent or, with decks, no
+    measurement has corrected the estimate, and why. While an impact or gust is uncorrected, return
+    a text that says this instead."""
     if b.is_estimate_missing_gust:
         return "pushed sideways while the target was out of view"
     age_s, why = b.position_correction_age_s, b.obs.external_position_problem
@@ -128,7 +131,9 @@ def position_loss_text(b: Belief) -> str:
 
 
 def excessive_variance_text(b: Belief) -> str:
-    """Return a text that names the variance that is too large, and its limit."""
+    """Return a text that names the variance that is too large, and its limit: the variance of the
+    estimated velocity or, if that is small enough, of the estimated position (with decks, of the
+    height). The text says so if this variance is unknown."""
     safety = b.profile.safety
     what, variance, unit = "velocity", b.max_axis_velocity_variance_m2ps2, "(m/s)^2"
     most = safety.flight_velocity_variance_m2ps2

@@ -36,16 +36,17 @@ class TargetBelief:
 
     Attributes:
         world_position_m, world_yaw_rad: position (3,) in the world frame of the state estimate, and
-            heading; None while unknown.
+            heading, counter-clockwise from world x; None while unknown.
         gear_to_target_distance_xy_m, gear_to_target_z_m: horizontal distance between gear and
             target, and height of the target above the gear; infinite while unknown.
         vehicle_to_target_yaw_rad: heading of the target relative to the vehicle's, positive
             counter-clockwise from above; infinite while unknown.
         vehicle_world_z_when_touching_m: world z of the body's origin at which the gear touches the
-            target.
-        age_s: time since the exposure of the last frame that measured the target.
+            target; infinite while unknown.
+        age_s: time since the exposure of the last frame that measured the target; infinite before
+            the first one.
         is_tracked: the target is visible, or the filter has predicted it without a measurement for
-            at most n_max frames.
+            at most `kalman.n_max` frames.
         is_fresh: the target is tracked, and `age_s` is at most `ascend.fresh_s` plus the camera's
             latency.
         is_small_marker_fresh: the last measurement of the small marker is no older than

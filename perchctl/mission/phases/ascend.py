@@ -138,8 +138,8 @@ AT_HOVER_POSITION = Condition[Context](
 
 
 def enter_ascend(state: PlannerState, previous_context: Context) -> PlannerState:
-    """Reset the search: if the aligned target is lost later, the search starts from the
-    beginning."""
+    """Reset the search: if the aligned target is lost later, the search starts from the beginning.
+    `previous_context` is not used."""
     del previous_context
     return replace(state, searched_position_count=0)
 

@@ -31,7 +31,8 @@ thrust, s."""
 
 
 def enter_complete(state: PlannerState, previous_context: Context) -> PlannerState:
-    """Record the contact: the magnet holds the vehicle here, at the offset of the last touch."""
+    """Record the contact: the magnet holds the vehicle where `previous_context`, from the tick
+    before the transition, places it, at the offset of the last touch."""
     belief = replace(
         state.belief,
         vehicle_world_z_at_last_contact_m=previous_context.telemetry.position_m[2],
