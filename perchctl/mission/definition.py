@@ -28,7 +28,7 @@ class PhaseDefinition:
     Attributes:
         maneuver: maneuver flown in this phase, which determines how the belief interprets evidence.
         enter: function that prepares the phase. It takes the state that has just entered the phase
-            and the context of the tick before the transition, and returns the new state.
+            and the context before the transition, in the same tick, and returns the new state.
             `state.entry.diagnosis` holds what the transition asserts about the vehicle
             (`VehicleDiagnosis`).
         act: function that returns the new state and the command of each tick.

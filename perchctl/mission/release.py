@@ -236,9 +236,9 @@ def choose_catch_setpoint_height_above_vehicle_m(
 
 def catch_falling_vehicle(c: Context) -> Action | None:
     """Catch a vehicle that is falling off the magnet: return a setpoint above it by the height that
-    the state prepared for the catch. None if no catch is prepared, with old telemetry, or once the
-    climb rate exceeds `MIN_CLIMB_RATE_TO_END_FALL_CATCH_MPS` or the catch has lasted
-    `MAX_FALL_CATCH_DURATION_S`."""
+    the state prepared for the catch. None if no catch is prepared, or with old telemetry. Also None
+    after `MIN_FALL_CATCH_DURATION_S`, once the climb rate is at least
+    `MIN_CLIMB_RATE_TO_END_FALL_CATCH_MPS`, and in any case after `MAX_FALL_CATCH_DURATION_S`."""
     state, tel, b = c.state, c.telemetry, c.belief
     if state.catch_setpoint_height_above_vehicle_m is None or not b.is_imu_fresh:
         return None

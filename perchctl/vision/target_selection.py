@@ -57,9 +57,9 @@ def marker_to_own_target_distance_m(
     corners_px: Array,
 ) -> float:
     """Return the horizontal distance, m, of a marker with corners (4, 2) px from the position of
-    the vehicle's own target, or from the gear if this position is unknown. The marker's position
-    follows from a pose estimated from its corners; if they yield no pose, the result is
-    `_ASSUMED_DISTANCE_WITHOUT_POSE_M`. If `attitude` is known, distances above
+    the vehicle's own target, or from the gear if this position or `attitude` is unknown. The
+    marker's position follows from a pose estimated from its corners; if they yield no pose,
+    `_ASSUMED_DISTANCE_WITHOUT_POSE_M` is assumed. If `attitude` is known, distances above
     `own_target.max_distance_m` become infinite."""
     seen = Detection(marker, corners_px, _RAW_CORNER_SIGMA_PX, are_corners_fitted=False)
     pose = estimate_pose([seen], t_s, attitude, setup)

@@ -484,7 +484,8 @@ class PipelineState:
 class PipelineOutput:
     """Result of processing one frame, for the planner and the log: the detected markers, their
     poses by source (``joint``, ``large``, ``small``), the target estimate (None if there is no
-    track), and why the frame's pose was rejected, if it was."""
+    track), and a note if the frame's pose was rejected or restarted the tracks, or if the frame
+    shows several targets."""
 
     detections: Detections
     poses: dict[str, MarkerPose]
@@ -493,7 +494,8 @@ class PipelineOutput:
     # Number of successive frames in which the two markers contradict each other.
     frames_with_contradicting_markers: int = 0
     picture_kind: PictureKind = "whole"
-    # Why the pose from this frame was rejected, or was accepted at an unexpected position.
+    # Why the pose from this frame was rejected, or was accepted at an unexpected position; or that
+    # the frame shows several targets.
     lock_note: str = ""
     # True if this frame showed another vehicle's target, judged by its position.
     is_foreign_target: bool = False

@@ -482,7 +482,8 @@ class ImuMotion(
     # end of the newest gap that may hide a fall
     last_gap_that_may_hide_fall_ended_at_s: float = -math.inf
     vehicle_restarted_at_s: float = -math.inf  # first sample after the vehicle restarted
-    # total change of the estimated height over the newest series of successive gaps; at most 0
+    # total change of the estimated height over the successive gaps up to the newest sample; at most
+    # 0, and 0 if no gap precedes that sample
     height_change_in_gap_m: float = 0.0
     mean_hover_thrust: float = 0.0  # mean thrust per measured g in flight
     # roll and pitch errors caused by corrections

@@ -91,8 +91,8 @@ def _find_gear_to_target_at_touch(
     previous_context: Context, diagnosis: VehicleDiagnosis
 ) -> GearToTargetDistance | None:
     """Return the distance between gear and target at the touch that ended the attempt; None if no
-    touch is known. `previous_context` is from the tick before the transition into RECOVER, and
-    `diagnosis` is what the transition asserts.
+    touch is known. `previous_context` is the context before the transition into RECOVER, in the
+    same tick, and `diagnosis` is what the transition asserts.
 
     If the vehicle is still at its contact, the recorded distance is returned. A press counts as a
     touch only if, at the target's height, a contact was proven or accelerometer and thrust showed

@@ -492,9 +492,9 @@ def _choose_search_mode(
 ) -> SearchMode:
     """Return the kind of search for this frame. If the previous frame showed a marker, the search
     is near the expected corners. Otherwise, to save time, the kinds of search alternate from frame
-    to frame. If no target is expected, the whole image is searched. If `is_line_fit_enabled` is
-    False, it is always searched, and only for sharp markers. If `frames_without_markers` is None,
-    all kinds are selected."""
+    to frame. If no target is expected, or if `is_line_fit_enabled` is False, the whole image is
+    searched; in the latter case, only for sharp markers. If `frames_without_markers` is None, all
+    kinds are selected in any case."""
     if frames_without_markers is None:
         return "all"
     if not is_line_fit_enabled or (is_target_expected and frames_without_markers % 2):
@@ -713,8 +713,9 @@ def refine_photometrically(
 
 def _initial_blur_sigma_px(corners: RefinedCorners | None) -> float:
     """Return the standard deviation of the initial blur, px, for a photometric fit. It is the blur
-    of the sides, minus the blur due to sampling, if lines were fitted to them; otherwise it is
-    `_DEFAULT_INITIAL_BLUR_SIGMA_PX`, which is also the upper limit."""
+    of the blurriest side if lines were fitted to the sides, without the blur due to sampling (its
+    variance is subtracted); otherwise it is `_DEFAULT_INITIAL_BLUR_SIGMA_PX`, which is also the
+    upper limit."""
     if (
         corners is None
         or not corners.are_corners_fitted
