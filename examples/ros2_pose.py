@@ -4,9 +4,9 @@ It needs ROS 2 (Humble or later) with rclpy, geometry_msgs and tf2_ros, but not 
 
     python3 ros2_pose.py --ros-args -p host:=127.0.0.1 -p port:=9870
 
-It publishes a PoseWithCovarianceStamped on ``target_pose`` and the transform to ``target``, both
-from the frame that `perchctl track --frame-id` names. The stamp is the time of exposure; for a
-recording, it is the time at which the pose arrives.
+For each picture with an accepted pose, it publishes a PoseWithCovarianceStamped on ``target_pose``
+and the transform to ``target``, both from the frame that `perchctl track --frame-id` names. The
+stamp is the time of exposure; for a recording, it is the time at which the pose arrives.
 """
 
 import json
