@@ -83,8 +83,8 @@ def is_combed(image: GreyImage) -> bool:
 
 
 def deinterlace_image(image: GreyImage) -> tuple[GreyImage, ...]:
-    """Return the top and the bottom field, each (h, w), if the image is combed; otherwise return
-    the image alone."""
+    """Return the top and the bottom field, each interpolated to the full size (h, w), if the image
+    (h, w) is combed; otherwise return the image alone."""
     if not is_combed(image):
         return (image,)
     return interpolate_field(image, 0), interpolate_field(image, 1)
@@ -126,8 +126,8 @@ def classify_interlacing(frame: Frame) -> Frame:
 
 
 def interpolate_fields(frame: Frame) -> tuple[Frame, Frame]:
-    """Return the top and the bottom field of a woven (interlaced) frame. Both have the time of the
-    frame."""
+    """Return the top and the bottom field of a woven (interlaced) frame, each interpolated to full
+    height. Both have the time of the frame."""
     return (
         replace(frame, image=interpolate_field(frame.image, 0), picture_kind="top", encoded=None),
         replace(

@@ -97,9 +97,10 @@ class FilterSetup:
     """Parameters of a track's Kalman filter.
 
     Attributes:
-        R, Q: covariance of the measurement noise (4, 4) and of the process noise per step (8, 8):
-            ``k1 I`` and ``k2 I`` of the paper (cm^2, deg^2), converted to SI.
-        P0: covariance (8, 8) after the first measurement.
+        R, Q: covariance of the measurement noise (4, 4), in the order yaw, x, y, z, and of the
+            process noise per step (8, 8), in the order of `MarkerTrack.x`: ``k1 I`` and ``k2 I`` of
+            the paper (cm^2, deg^2), converted to SI.
+        P0: covariance (8, 8) of `MarkerTrack.x` after the first measurement.
         velocity_factor_per_unseen_frame: factor by which the velocity and the yaw rate are
             multiplied in each frame without a measurement, ``kalman.alpha`` of the profile
             (equation 3).
@@ -206,14 +207,16 @@ def vector_jacobian_wrt_tilt(vector_m: Array) -> Array:
 
 
 def transition_matrix(dt_s: float) -> Array:
-    """Return the state transition matrix F (8, 8) for a time step `dt_s` (paper, equation 1): yaw,
-    x, y and z each change by their rate times `dt_s`, and the rates stay constant."""
+    """Return the state transition matrix F (8, 8) of `MarkerTrack.x` for a time step `dt_s` (paper,
+    equation 1): yaw, x, y and z each change by their rate times `dt_s`, and the rates stay
+    constant."""
     return _IDENTITY_8 + dt_s * _RATE_INTEGRATION_MATRIX
 
 
 def process_noise_covariance(dt_s: float, target_position_m: Array, setup: FilterSetup) -> Array:
-    """Return the process noise Q (8, 8) over `dt_s` for a target at `target_position_m` (3,) in the
-    track's frame: relative to the gear in level axes, or in the world.
+    """Return the process noise Q (8, 8) of `MarkerTrack.x` over `dt_s` for a target at
+    `target_position_m` (3,) in the track's frame: relative to the gear in level axes, or in the
+    world.
 
     The noise is that of white-noise accelerations, plus the drift of the state estimate in the
     world frame. In the level frame, it grows with the target's distance because rotations of the
@@ -290,9 +293,9 @@ def step_track(
 
     Returns None if there is no track, because the marker was never measured or was not seen for
     more than `n_max` frames (k_n <= n_max in equation 3). A frame that is not newer than the track
-    changes nothing. A gap of more than `MAX_TRACK_GAP_S` in either direction restarts the track,
-    and so does a measurement that the motion model does not explain
-    (`FilterSetup.max_nis_without_restart`).
+    changes nothing. A gap of more than `MAX_TRACK_GAP_S` in either direction ends the track, and a
+    measurement then starts a new one. The track also restarts at a measurement that the motion
+    model does not explain (`FilterSetup.max_nis_without_restart`).
     """
     if measurement is not None and not is_finite(measurement.z):
         measurement = None
@@ -368,7 +371,8 @@ def predict_track(track: MarkerTrack, t_s: float, setup: FilterSetup) -> MarkerT
 
 
 def _limit_target_speed(x: Array, setup: FilterSetup) -> Array:
-    """Return the state (8,) with the target's speed limited to `setup.max_target_speed_mps`."""
+    """Return the state `x` (8,), whose velocity (x, y, z) is scaled down if the speed exceeds
+    `setup.max_target_speed_mps`. Positions, yaw and yaw rate stay unchanged."""
     speed_mps = math.hypot(*x[VELOCITY].tolist())
     if speed_mps <= setup.max_target_speed_mps:
         return x

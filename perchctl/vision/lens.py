@@ -19,7 +19,8 @@ _ZERO_VECTOR = np.zeros(3)
 
 
 def undistort_to_normalised(points_px: Array, camera: CameraModel) -> Array:
-    """Convert pixels (n, 2) to normalised coordinates (n, 2): x/z and y/z in the camera frame.
+    """Convert pixels (n, 2) of the distorted image to normalised coordinates (n, 2): x/z and y/z in
+    the camera frame.
 
     A point outside the valid range of the lens model becomes NaN or a point far outside the image;
     no exception is raised.
@@ -40,8 +41,8 @@ def undistort_px(points_px: Array, camera: CameraModel) -> Array:
 
 
 def pinhole_px(points_normalised: Array, camera: CameraModel) -> Array:
-    """Convert normalised coordinates (n, 2) to pixels (n, 2) of a pinhole camera with the camera's
-    `K`."""
+    """Convert normalised coordinates (n, 2), x/z and y/z in the camera frame, to pixels (n, 2) of a
+    pinhole camera with the camera's `K`."""
     K = camera.K
     result = np.empty_like(points_normalised)
     result[:, 0] = K[0, 0] * points_normalised[:, 0] + K[0, 1] * points_normalised[:, 1] + K[0, 2]
@@ -50,17 +51,17 @@ def pinhole_px(points_normalised: Array, camera: CameraModel) -> Array:
 
 
 def distort_to_px(points_normalised: Array, camera: CameraModel) -> Array:
-    """Convert normalised coordinates (n, 2) to pixels (n, 2) of the distorted image; the inverse
-    of `undistort_to_normalised`."""
+    """Convert normalised coordinates (n, 2), x/z and y/z in the camera frame, to pixels (n, 2) of
+    the distorted image; the inverse of `undistort_to_normalised`."""
     rays = np.ones((len(points_normalised), 1, 3))
     rays[:, 0, :2] = points_normalised
     return _project_points(rays, _ZERO_VECTOR, _ZERO_VECTOR, camera)
 
 
 def project(points_m: Array, rvec_rad: Array, tvec_m: Array, camera: CameraModel) -> Array:
-    """Project points (n, 3), m, to pixels (n, 2) of the distorted image. The points' frame has the
-    pose (rvec, tvec) in the camera frame. The pixels of points behind the camera are
-    meaningless."""
+    """Project points (n, 3), m, to pixels (n, 2) of the distorted image. The rotation vector
+    `rvec_rad` and the translation `tvec_m` are the pose of the points' frame in the camera frame.
+    The pixels of points behind the camera are meaningless."""
     points = np.ascontiguousarray(points_m, dtype=np.float64).reshape(-1, 1, 3)
     rvec, tvec = np.asarray(rvec_rad, float).ravel(), np.asarray(tvec_m, float).ravel()
     return _project_points(points, rvec, tvec, camera)

@@ -76,9 +76,9 @@ def estimate_marker_poses(
     track.
 
     `attitude` is the vehicle's attitude at the time of the frame (None if unknown). `start_pose` is
-    the last pose of the target, corrected for the vehicle's motion since then.
-    `previous_target_normal_cam` (3,) is the unit normal of the target (out of the paper) in its
-    last pose, in the axes of the camera at that time.
+    the last pose of the target in the camera frame, corrected for the vehicle's motion since then
+    (None if unknown). `previous_target_normal_cam` (3,) is the unit normal of the target (out of
+    the paper) in its last pose, in the axes of the camera at that time (None if unknown).
     """
     seen, t_s = correct_rolling_shutter(detections, setup), detections.t_s
     joint = None
@@ -167,9 +167,9 @@ def merge_tracks(
 
 def widen_covariance_for_rival(merged: MergedTarget, rival_state: Array) -> MergedTarget:
     """Increase the target's covariance so that it also covers the position of a rival: a
-    target-like pattern, with the state `rival_state` (8,), whose position contradicts the target's
-    track. If d is the difference between the two positions, the covariance grows by d d^T. The
-    variance of the yaw grows by the squared difference of the yaws."""
+    target-like pattern, with the state `rival_state` (8,) in the frame of `merged`, whose position
+    contradicts the target's track. If d is the difference between the two positions, the covariance
+    grows by d d^T. The variance of the yaw grows by the squared difference of the yaws."""
     off = rival_state[_XYZ_YAW_STATE_INDICES] - merged.track_frame_xyz_yaw
     off_m, off_rad = off[:3], wrap_rad(float(off[3]))
     return replace(
@@ -257,8 +257,9 @@ def make_marker_weight_matrix(weights: WeightsConfig) -> Array:
 
 
 def merge_xyz_yaw(large: Array, small: Array, weights: WeightsConfig) -> Array:
-    """Return the weighted mean of (x, y, z, yaw) of the two markers, each (4,), by equation 8 of
-    the paper. The yaw angles are averaged on the circle."""
+    """Return the weighted mean of (x, y, z, yaw) of the two markers, each (4,), m and rad, by
+    equation 8 of the paper. The yaw angles are averaged on the circle. `weights` contains the
+    weights of the large marker, 0 to 1."""
     W = make_marker_weight_matrix(weights)
     merged = W @ np.stack([large, small], axis=1).ravel()
     merged[3] = circular_mean(W[3, 6:8], np.array([large[3], small[3]]))
@@ -281,6 +282,6 @@ def are_marker_positions_inconsistent(
 
 
 def choose_more_certain_pose(large: MarkerPose, small: MarkerPose) -> MarkerPose:
-    """Return the pose whose position has the smaller standard deviation."""
+    """Return the pose whose position has the smaller standard deviation (norm of `sigma_m`)."""
     spread_large, spread_small = (float(np.linalg.norm(p.sigma_m)) for p in (large, small))
     return small if spread_small < spread_large else large

@@ -106,10 +106,10 @@ def make_pipeline(
     """Return the pipeline for a profile and a calibrated camera. Several image streams may share
     one pipeline.
 
-    `hidden_mask` (h, w) is True for pixels that the vehicle covers in the camera's images, and
-    replaces the mask in the file `camera.mask`. If it is None, this file is read. If the profile
-    names no file, no pixels are masked. Raises NotFound if the file is missing, and InvalidValue if
-    it is invalid.
+    `hidden_mask` (h, w) is True for pixels that the vehicle covers in the camera's images, before
+    `camera.mirrored` flips them, and replaces the mask in the file `camera.mask`. If it is None,
+    this file is read. If the profile names no file, no pixels are masked. Raises NotFound if the
+    file is missing, and InvalidValue if it is invalid.
     """
     pose_setup = PoseSetup(
         config=profile.pose,
@@ -265,9 +265,10 @@ def step_detections(
     start_pose: PoseCandidate | None = None,
     picture_kind: PictureKind = "whole",
 ) -> tuple[PipelineState, PipelineOutput]:
-    """Run the part of `step` that follows detection: poses, tracks and target estimate.
-    `start_pose` is the target's expected pose in the camera frame; None if unknown. `picture_kind`
-    is passed on to the output: whether the image is a whole frame, interlaced, or a field."""
+    """Run the part of `step` that follows detection: poses, tracks and target estimate. `attitude`
+    is the vehicle's state at the time of the detections; None if unknown. `start_pose` is the
+    target's expected pose in the camera frame; None if unknown. `picture_kind` is passed on to the
+    output: whether the image is a whole frame, interlaced, or a field."""
     last_pose, t_s = state.last_pose, detections.t_s
     normal = (
         target_normal_cam(last_pose.pose) if last_pose is not None and attitude is None else None

@@ -50,8 +50,9 @@ class PoseSetup:
 
     @cached_property
     def corners_m(self) -> dict[_PoseSource, Array]:
-        """Corners (4, 3) of each marker in its own axes, m. ``joint`` (8, 3) contains the corners
-        of the large marker, then those of the small one."""
+        """Corners (4, 3) of each marker, m, in its own axes: x right and y up on the paper, z out
+        of it. The order is top left, top right, bottom right, bottom left. ``joint`` (8, 3)
+        contains the corners of the large marker, then those of the small one."""
         large, small = (square_corners(m.side_m) for m in (self.target.large, self.target.small))
         return {"large": large, "small": small, "joint": np.concatenate([large, small])}
 
@@ -69,15 +70,15 @@ class PoseSetup:
 
 
 def square_corners(side_m: float) -> Array:
-    """Return a marker's corners in its own axes, (4, 3) m with z = 0, in the order top left, top
-    right, bottom right, bottom left."""
+    """Return the corners, (4, 3) m, of a marker with the side `side_m` in its own axes (x right and
+    y up on the paper, z = 0), in the order top left, top right, bottom right, bottom left."""
     h = side_m / 2.0
     return np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
 
 
 def R_level_body_of(attitude: VehicleState | None) -> Array:
-    """Return the rotation ``R_level_body`` (3, 3) for an attitude. If the attitude is None, the
-    vehicle is assumed to be level."""
+    """Return the rotation (3, 3) from body to level axes for an attitude, given by its roll and
+    pitch. If the attitude is None, the vehicle is assumed to be level."""
     return np.eye(3) if attitude is None else attitude.R_level_body
 
 
@@ -91,12 +92,13 @@ def estimate_pose(
 ) -> MarkerPose | None:
     """Estimate the target's pose from the corners of one marker, or of both markers jointly.
 
-    A planar marker allows two tilts (pose ambiguity). If a `start` pose is given, it is only
-    refined and keeps its tilt, unless the refinement fails or contradicts the expected tilt.
-    Otherwise the vehicle's roll and pitch resolve the ambiguity, because the target is horizontal.
-    Without an attitude, the tilt with the normal closer to `previous_target_normal_cam` (3,) is
-    chosen. Returns None if the corners yield no pose, because there is no finite solution in front
-    of the camera, or because the reprojection error (RMS over the corners) is above
+    A planar marker allows two tilts (pose ambiguity). If a `start` pose in the camera frame is
+    given, it is only refined and keeps its tilt, unless the refinement fails or contradicts the
+    expected tilt. Otherwise the vehicle's roll and pitch resolve the ambiguity, because the target
+    is horizontal. Without an attitude, the tilt with the normal closer to
+    `previous_target_normal_cam` (3,), the target's last unit normal (out of the paper) in camera
+    axes, is chosen. Returns None if the corners yield no pose, because there is no finite solution
+    in front of the camera, or because the reprojection error (RMS over the corners) is above
     `pose.max_reprojection_px`.
     """
     source: _PoseSource = "joint" if len(detections) > 1 else detections[0].marker
@@ -231,8 +233,9 @@ def target_normal_cam(pose: MarkerPose) -> Array:
 
 def _yaw_gradient(R_level_cam: Array, R_level_target: Array, dR_drvec: Array) -> Array:
     """Return the gradient (3,) of the target's yaw in the level frame with respect to the rotation
-    vector. The yaw is atan2(R[1, 0], R[0, 0]) with R = `R_level_target`. `dR_drvec` (3, 9) is the
-    derivative of the rotation matrix with respect to the rotation vector."""
+    vector. The yaw is atan2(R[1, 0], R[0, 0]) with R = `R_level_target` (3, 3). `R_level_cam` (3,
+    3) rotates from camera to level axes. `dR_drvec` (3, 9) is the derivative of the rotation matrix
+    from marker to camera axes, row by row, with respect to the rotation vector, rad."""
     # derivative of the target's x axis: rows for the components of rvec, columns for the level axes
     dx = dR_drvec.reshape(3, 3, 3)[:, :, 0].dot(R_level_cam.T)
     hx, hy = float(R_level_target[0, 0]), float(R_level_target[1, 0])
@@ -268,8 +271,8 @@ class PoseCandidate:
 
 @dataclass(frozen=True, eq=False)
 class ScoredPose(PoseCandidate):
-    """A pose candidate with its reprojection errors (n, 2), px, projected minus measured, and their
-    Jacobian (2n, 6) with respect to rvec and tvec."""
+    """A pose candidate with its reprojection errors (n, 2), px in the image of a pinhole camera,
+    projected minus measured, and their Jacobian (2n, 6) with respect to rvec and tvec."""
 
     reprojection_error_px: Array
     reprojection_jacobian: Array
@@ -419,8 +422,8 @@ def _whitened_sheet_curl_shift(points: WeightedCorners, scored: ScoredPose) -> A
 
 
 def angle_to_expected_normal_rad(rvec: Array, expected_normal_cam: Array) -> float:
-    """Return the angle, rad, between `expected_normal_cam` and the normal of a marker with the
-    rotation vector `rvec`."""
+    """Return the angle, rad, between the unit vector `expected_normal_cam` (3,) and the normal (out
+    of the paper), both in camera axes, of a marker with the rotation vector `rvec` (3,), rad."""
     normal = rotation_matrix(rvec)[:, 2]
     return math.acos(max(-1.0, min(1.0, float(normal @ expected_normal_cam))))
 
@@ -501,10 +504,11 @@ def _choose_most_likely_pose(
 
 
 def corner_lift_by_sheet_curl(object_points_m: Array, sheet_curl_sigma_per_m: float) -> Array:
-    """Return the height of corners (n, 3) above the flat sheet for one standard deviation of two
-    curl modes: a bowl (all corners on one side) and a saddle (neighbouring corners on opposite
-    sides). `sheet_curl_sigma_per_m` is the height per squared distance from the centre. The result
-    has the shape (2n, 2), m; each corner has two equal rows, for its x and y."""
+    """Return the height of corners (n, 3), m, in the marker's axes, above the flat sheet for one
+    standard deviation of two curl modes: a bowl (all corners on one side) and a saddle
+    (neighbouring corners on opposite sides). `sheet_curl_sigma_per_m` is the standard deviation of
+    the height divided by the squared distance from the centre. The result has the shape (2n, 2), m;
+    each corner has two equal rows, for its x and y."""
     x, y = object_points_m[:, 0], object_points_m[:, 1]
     lift: Array = sheet_curl_sigma_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
     return lift.repeat(2, axis=0)
@@ -563,8 +567,8 @@ class WeightedCorners:
     """Corners with the weights of their reprojection errors.
 
     Attributes:
-        object_points_m, image_points_px: corners (n, 3) on the target, and (n, 2) in the image of a
-            pinhole camera `K` (3, 3).
+        object_points_m, image_points_px: corners (n, 3) in the marker's axes, and (n, 2) in the
+            image of a pinhole camera `K` (3, 3).
         sigma_px: standard deviations (n,) of the corners.
         whitening_matrix: matrix (2n, 2n) that transforms the errors of the corners to independent
             errors with unit variance.
@@ -599,9 +603,9 @@ def compute_corner_weights(
     marker's corners were measured: from their covariance `cov_px2` if there is one, from the errors
     of four fitted lines, or otherwise from independent errors with `sigma_px`.
 
-    `object_points_m` (n, 3) are the corners on the target, `image_points_px` (n, 2) the corners in
-    a pinhole camera with matrix K. `corner_lift_per_sheet_curl_sigma_m` is the result of
-    `corner_lift_by_sheet_curl`.
+    `object_points_m` (n, 3) are the corners in the marker's axes, `image_points_px` (n, 2) the
+    corners in the image of a pinhole camera with the matrix `K`.
+    `corner_lift_per_sheet_curl_sigma_m` is the result of `corner_lift_by_sheet_curl`.
     """
     n, m = len(image_points_px), len(detections)
     W, error_shifts = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
@@ -668,8 +672,8 @@ def _outward_normals(corners: Array) -> Array:
 
 def _side_sigma_px(detection: Detection, corners: Array) -> Array:
     """Return the standard deviation of each side's position perpendicular to it, (4,) px, for a
-    detection with `corners` (4, 2) px. In an image from a single field, it is larger for sides
-    along the image rows because every second row is interpolated."""
+    detection with `corners` (4, 2) in pixels of a pinhole camera. In an image from a single field,
+    it is larger for sides along the image rows because every second row is interpolated."""
     sides = corners.take(_SIDE_END_CORNER_INDICES, axis=0) - corners
     lying = np.abs(sides[:, 0]) / np.maximum(np.hypot(sides[:, 0], sides[:, 1]), 1e-9)
     rows = 0.5 * math.pi * np.abs(sides[:, 1])

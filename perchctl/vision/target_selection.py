@@ -56,10 +56,11 @@ def marker_to_own_target_distance_m(
     marker: MarkerName,
     corners_px: Array,
 ) -> float:
-    """Return the horizontal distance, m, of a marker with corners (4, 2) px from the position of
-    the vehicle's own target, or from the gear if this position or `attitude` is unknown. The
-    marker's position follows from a pose estimated from its corners; if they yield no pose,
-    `_ASSUMED_DISTANCE_WITHOUT_POSE_M` is assumed. If `attitude` is known, distances above
+    """Return the horizontal distance, m, of a marker with corners (4, 2) px in the distorted image
+    from the position of the vehicle's own target, or from the gear if this position or the attitude
+    is unknown. `t_s` and `attitude` are those of the frame. The marker's position follows from a
+    pose estimated from its corners; if they yield no pose, the result is
+    `_ASSUMED_DISTANCE_WITHOUT_POSE_M`. If `attitude` is known, distances above
     `own_target.max_distance_m` become infinite."""
     seen = Detection(marker, corners_px, _RAW_CORNER_SIGMA_PX, are_corners_fitted=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
@@ -142,8 +143,8 @@ def make_track_measurement(
     filter_setup: FilterSetup,
     setup: PoseSetup,
 ) -> TrackMeasurement:
-    """Convert a pose to a filter measurement of (yaw, x, y, z): in the world frame of the state
-    estimate (if `is_in_world_frame`), or relative to the gear in the level frame.
+    """Convert a pose to a filter measurement of (yaw, x, y, z), rad and m: in the world frame of
+    the state estimate (if `is_in_world_frame`), or relative to the gear in the level frame.
 
     Its covariance R does not include the errors that are the same in every frame. The shifts due to
     these errors, the biases of the vehicle's roll and pitch and of the print, are returned

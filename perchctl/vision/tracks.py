@@ -355,8 +355,9 @@ def update_lock(
     """Return the updated lock after the gate has accepted `frame_pose`. `track` is the track that
     this pose has updated.
 
-    The count of accepted frames and the previous track are kept, unless the track has restarted at
-    a rival or the frame (level or world) of the tracks has changed; then the lock begins anew.
+    If `lock` is None, a new lock begins. The count of accepted frames and the previous track are
+    kept, unless the track has restarted at a rival or the frame (level or world) of the tracks has
+    changed; then the lock begins anew.
     """
     anew = verdict.restarts_track and not verdict.restarts_at_locked_target
     before = (
@@ -603,10 +604,10 @@ _MOTION_ERROR_SMOOTHING_FACTOR = 0.1
 def predict_corners(
     last_pose: LastPose | None, t_s: float, attitude: VehicleState | None, setup: PoseSetup
 ) -> tuple[dict[MarkerName, Array] | None, PoseCandidate | None]:
-    """Predict the corners of both markers, (4, 2) px, and the pose of the target in the camera
-    frame at `t_s` from the last pose and the vehicle's motion since then. The motion is the mean of
-    two estimates, from positions and from velocities, weighted by their recent errors
-    (`LastPose.motion_errors`).
+    """Predict the corners of both markers, (4, 2) px in the distorted image, and the pose of the
+    target in the camera frame at `t_s` from the last pose and the vehicle's motion since then. The
+    motion is the mean of two estimates, from positions and from velocities, weighted by their
+    recent errors (`LastPose.motion_errors`).
 
     Returns (None, last pose) if the vehicle's attitude at either time is unknown, (None, predicted
     pose) if the corners have no finite projection, and (None, None) if there is no recent pose or

@@ -144,8 +144,8 @@ def to_grey(image: Any) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """One marker's corners in the image, (4, 2) px, in the order of cv2.aruco: top left, top right,
-    bottom right, bottom left. (0, 0) is the centre of the top-left pixel.
+    """One marker's corners in the distorted image, (4, 2) px, in the order of cv2.aruco: top left,
+    top right, bottom right, bottom left. (0, 0) is the centre of the top-left pixel.
 
     Attributes:
         sigma_px: standard deviation of the corners, from the residuals of the line fit, or a
@@ -252,7 +252,8 @@ class MarkerPose:
     Attributes:
         rvec_rad, tvec_m: pose in the OpenCV camera frame, with cv2.aruco's marker axes, (3,).
         e_m: position of the target relative to the gear in the level frame, (3,).
-        e_yaw_rad: heading of the target's x axis in the level frame.
+        e_yaw_rad: heading of the target's x axis in the level frame, positive counter-clockwise
+            seen from above.
         sigma_m, sigma_yaw_rad: standard deviations of `e_m`, (3,), and of `e_yaw_rad`.
         rms_reprojection_px: RMS distance between the projected and the measured corners.
         chi2_per_dof: sum of the squared errors of the corners divided by their variances, per
@@ -283,7 +284,8 @@ class MarkerPose:
 class MarkerTrack:
     """State of a marker's Kalman filter (paper, section II-A.1).
 
-    The state `x` (8,) contains yaw, yaw rate, then position and velocity of x, y, z, in SI units;
+    The state `x` (8,) contains yaw, yaw rate, then position and velocity of x, y, z, in SI units,
+    in the track's frame: relative to the gear in level axes, or in the world;
     `perchctl.vision.filter` defines names for its indices. `P` (8, 8) is its covariance due to the
     noise of measurements and motion. Column k of `state_shift_per_bias_sigma` (8, 4) is the change
     of the state for one standard deviation of bias k: the vehicle's roll and pitch, the print's

@@ -69,9 +69,9 @@ def find_expected_blurred(
     expected_corners_px: Mapping[MarkerName, Array],
     frame_counter_for_initial_blur: int | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
-    """Find blurred markers near their expected corners (4, 2) px. Each marker is shifted to where
-    its drawing correlates best with the image, and then fitted (`align_marker`). Return the first
-    marker that the fit confirms, or an empty dict if there is none.
+    """Find blurred markers near their expected corners (4, 2) px in the image. Each marker is
+    shifted to where its drawing correlates best with the image, and then fitted (`align_marker`).
+    Return the first marker that the fit confirms, or an empty dict if there is none.
 
     The caller increments `frame_counter_for_initial_blur` with each frame. To save time, the fits
     start with a small blur if the counter is even and with a large blur if it is odd. If the
@@ -151,10 +151,10 @@ def _rank_quads(
 def _align_by_correlation(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> Array:
-    """Return the corners (4, 2) px, translated to the position at which the marker's ideal
-    black-and-white pattern (its drawing) correlates best with the image. The search covers 10 px or
-    half a side in each direction, whichever is larger. If the image leaves no room for a search,
-    the corners are returned unchanged."""
+    """Return `corners_px` (4, 2), translated in the image to the position at which the marker's
+    ideal black-and-white pattern (its drawing) correlates best with the image. The search covers 10
+    px or half a side in each direction, whichever is larger. If the image leaves no room for a
+    search, the corners are returned unchanged."""
     side_px = mean_side_px(corners_px)
     scale = min(1.0, _MAX_TEMPLATE_PX / (2.0 * side_px))
     reach = max(_MAX_POSITION_ERROR_PX, _MAX_POSITION_ERROR_SIDES * side_px)
@@ -188,9 +188,9 @@ def _render_template(
     pattern: MarkerPattern, sample_points_half_sides: Array, side_px: float
 ) -> NDArray[np.float32]:
     """Return the whiteness (n, n), 0 to 1, of the marker's drawing at `sample_points_half_sides`
-    (n, n, 2), in half sides from the marker's centre, blurred for a marker whose side is `side_px`
-    in the image. Areas with unknown content, the centre of the large marker and the surroundings of
-    the paper, are grey."""
+    (n, n, 2), in half sides from the marker's centre, blurred by half a cell, but at least 1 px.
+    `side_px` is the marker's side in the template. Areas with unknown content, the centre of the
+    large marker and the surroundings of the paper, are grey."""
     n = len(pattern.drawing.cell_whiteness)
     cell = np.floor((sample_points_half_sides + 1.0) * 0.5 * n).astype(np.intp)
     inside = ((cell >= 0) & (cell < n)).all(axis=2)
@@ -237,12 +237,12 @@ def align_marker(
     """Fit a marker's drawing to the image and return its corners; None if the image does not match
     the drawing.
 
-    The fit starts at `start_corners_px` (4, 2) with the initial blur `initial_blur_sigma_px`
-    (standard deviation). `max_motion_from_start_sides` limits the distance of the fitted corners
-    from the start, and `max_corner_sigma_sides` limits their standard deviation; both are in side
-    lengths. If `must_exclude_other_codewords` is True, the image must also exclude every other
-    codeword (`excludes_other_codewords`); set it to False if the other marker already identifies
-    this one.
+    The fit starts at `start_corners_px` (4, 2) in the distorted image with the initial blur
+    `initial_blur_sigma_px` (standard deviation). `max_motion_from_start_sides` limits the distance
+    of the fitted corners from the start, and `max_corner_sigma_sides` limits their standard
+    deviation; both are in side lengths. If `must_exclude_other_codewords` is True, the image must
+    also exclude every other codeword (`excludes_other_codewords`); set it to False if the other
+    marker already identifies this one.
     """
     side_px = mean_side_px(start_corners_px)
     if not side_px >= MIN_MARKER_SIDE_PX:

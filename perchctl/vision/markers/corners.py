@@ -38,28 +38,29 @@ own coordinates."""
 
 
 def homography_from_centred_square(corners: Array) -> Array:
-    """Return the homography (3, 3) that maps the centred square, with corners at -1 and 1, to
-    `corners` (4, 2)."""
+    """Return the homography (3, 3) that maps the centred square, with corners (-1, -1), (1, -1),
+    (1, 1) and (-1, 1), to `corners` (4, 2) in this order."""
     H = cv2.getPerspectiveTransform(_CENTRED_SQUARE_F32, corners.astype(np.float32))
     return np.asarray(H, dtype=np.float64)
 
 
 def homography_to_centred_square(corners: Array) -> Array:
-    """Return the homography (3, 3) that maps `corners` (4, 2) to the centred square, with corners
-    at -1 and 1."""
+    """Return the homography (3, 3) that maps `corners` (4, 2) to the corners (-1, -1), (1, -1), (1,
+    1) and (-1, 1) of the centred square, in this order."""
     H = cv2.getPerspectiveTransform(corners.astype(np.float32), _CENTRED_SQUARE_F32)
     return np.asarray(H, dtype=np.float64)
 
 
 def apply_homography(H: Array, points: Array) -> Array:
-    """Return the points (..., 2) mapped by the homography."""
+    """Return the points (..., 2) mapped by the homography `H` (3, 3)."""
     images = cv2.perspectiveTransform(points.reshape(-1, 1, 2), H)
     return np.asarray(images, dtype=np.float64).reshape(points.shape)
 
 
 def corners_jacobian_wrt_homography_increment(homography: Array) -> Array:
-    """Return the Jacobian (8, 8) of the marker's corners (x0, y0, x1, y1, ...), projected by a
-    homography (3, 3), with respect to the `homography_increment` of `increment_homography`."""
+    """Return the Jacobian (8, 8) of the corners (x0, y0, x1, y1, ...) of the centred square (-1 to
+    1), projected by `homography` (3, 3), with respect to the `homography_increment` of
+    `increment_homography`."""
     q = _CENTRED_SQUARE_HOMOGENEOUS.dot(homography.T)
     x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
     A = (homography[:2, :2] - x[:, :, None] * homography[2, :2]) / d
@@ -67,9 +68,9 @@ def corners_jacobian_wrt_homography_increment(homography: Array) -> Array:
 
 
 def increment_homography(H: Array, homography_increment: Array) -> Array:
-    """Return H (I + P), scaled so that its last element is 1. `homography_increment` (8,) contains
-    the first eight elements of P (3, 3), row by row; the last one is 0. P is composed with H, not
-    added to it."""
+    """Return H (I + P), for a homography `H` (3, 3), scaled so that its last element is 1.
+    `homography_increment` (8,) contains the first eight elements of P (3, 3), row by row; the last
+    one is 0. P is composed with H, not added to it."""
     H = H @ np.array(
         [
             [1 + homography_increment[0], homography_increment[1], homography_increment[2]],
@@ -81,7 +82,8 @@ def increment_homography(H: Array, homography_increment: Array) -> Array:
 
 
 def side_lengths_px(corners_px: Array) -> Array:
-    """Return the side lengths (..., 4), px, of squares with corners (..., 4, 2)."""
+    """Return the side lengths (..., 4), px, of squares with corners (..., 4, 2). Side k runs from
+    corner k to corner k + 1."""
     d = corners_px.take(NEXT_CORNER, axis=-2) - corners_px
     return np.asarray(np.hypot(d[..., 0], d[..., 1]), dtype=np.float64)
 
@@ -100,7 +102,8 @@ def signed_double_area(corners: Array) -> Array:
 
 
 def is_inside_image(corners_px: Array, shape: tuple[int, ...], margin_px: float = 0.0) -> bool:
-    """True if all corners (4, 2) are at least `margin_px` inside the edges of an image (h, w)."""
+    """True if all corners (4, 2) are at least `margin_px` inside the edges of an image with the
+    given `shape` (h, w); False for NaN."""
     h, w = shape[:2]
     right, low = w - 1 - margin_px, h - 1 - margin_px
     # NaN yields False.
@@ -110,9 +113,9 @@ def is_inside_image(corners_px: Array, shape: tuple[int, ...], margin_px: float 
 def scale_square(
     corners_px: Array, new_to_given_side_ratio: float, camera: CameraModel | None = None
 ) -> Array:
-    """Return the corners (4, 2) px of a square with the same centre and plane as the given one. Its
-    side is `new_to_given_side_ratio` times the given side. If `camera` is None, lens distortion is
-    ignored."""
+    """Return the corners (4, 2) px of a square with the same centre and plane as the square
+    `corners_px` (4, 2), both in the distorted image. The new side is `new_to_given_side_ratio`
+    times the given side. If `camera` is None, lens distortion is ignored."""
     straight = corners_px if camera is None else undistort_to_normalised(corners_px, camera)
     found = apply_homography(
         homography_from_centred_square(straight),
@@ -126,9 +129,10 @@ def add_missing_marker_corners(
     small_to_large_side_ratio: float,
     camera: CameraModel,
 ) -> dict[MarkerName, Array]:
-    """Return the corners (4, 2) px of both markers. If one marker is missing, its corners are
-    computed from the other one and `small_to_large_side_ratio`, the side of the small marker
-    divided by the side of the large one."""
+    """Return the corners (4, 2) px of both markers in the distorted image. If one marker is
+    missing, its corners are computed from the other one and `small_to_large_side_ratio`, the side
+    of the small marker divided by the side of the large one. If both are missing, the result is
+    empty."""
     both = dict(expected_corners_px)
     if "small" not in both and "large" in both:
         both["small"] = scale_square(both["large"], small_to_large_side_ratio, camera)
@@ -186,8 +190,9 @@ def refine_subpix(
     window, return the raw corners.
 
     Each corner p solves sum grad I(q) grad I(q)' (p - q) = 0 over the pixels q of a window that
-    extends half a cell, 1 to 5 px, to each side. Blur moves such corners inwards by 0.15 to 0.3 px,
-    and the target then seems too far away. The result's `are_corners_fitted` is therefore False.
+    extends half a cell, 1 to 5 px, to each side. `cells_per_side` includes the border and sets the
+    size of a cell. Blur moves such corners inwards by 0.15 to 0.3 px, and the target then seems too
+    far away. The result's `are_corners_fitted` is therefore False.
     """
     side_px = float(side_lengths_px(raw_corners_px).min())
     half = int(np.clip(round(0.5 * side_px / cells_per_side), 1, 5))

@@ -95,7 +95,7 @@ def is_target_truncated(
     """True if every expected marker, with corners (4, 2) px, may be truncated by the border of an
     image with the given `shape` (h, w), because a corner is outside the image or less than
     `_UNCERTAIN_TRUNCATION_MARGIN_PX` from its border, or is partly hidden by the vehicle's gear.
-    False if no marker is expected."""
+    `hidden_mask` (h, w) is True for pixels that the gear hides. False if no marker is expected."""
     whole = [
         corners
         for corners in expected_corners_px.values()
@@ -122,9 +122,9 @@ def fit_truncated_markers(
     detector_input: DetectorInput, expected_corners_px: Mapping[MarkerName, Array]
 ) -> dict[MarkerName, RefinedCorners]:
     """Fit the pose of the target to its visible part, starting at `expected_corners_px`, the
-    predicted corners of each marker, (4, 2) px. Return the corners of one marker, projected from
-    the fitted pose: of the small marker if enough of its edge points were found, otherwise of the
-    large one.
+    predicted corners of each marker, (4, 2) px in the distorted image. Return the corners of one
+    marker, projected from the fitted pose: of the small marker if enough of its edge points were
+    found, otherwise of the large one.
 
     The result is empty if the target has no small marker, if the small marker's cells are smaller
     than `_MIN_SMALL_MARKER_CELL_PX`, or if the image does not match the target or does not
@@ -241,8 +241,8 @@ def _search_near_pose(
     start: RigidPose, texture: DrawingTexture, coarse_image: CoarseUndistortedImage
 ) -> RigidPose | None:
     """Search poses that are shifted from `start` across the image and along the line of sight.
-    Return the pose at which the rendered drawing correlates best with the coarse image; None if the
-    correlation is low everywhere."""
+    Return the pose at which the drawing, rendered from `texture`, correlates best with the coarse
+    image; None if the correlation is low everywhere."""
     best, pose, lattice = _MIN_COARSE_CORRELATION, None, coarse_image.lattice
     for growth in _RANGE_SCALE_CANDIDATES:
         t = start.t_cam_drawing_half_sides * (1.0, 1.0, 1.0 / growth)
@@ -285,9 +285,10 @@ def _is_pose_fit_reliable(pose_fit: PoseFit) -> bool:
 def _project_marker_corners(
     pose_fit: PoseFit, side_to_large_side_ratio: float, camera: CameraModel
 ) -> RefinedCorners | None:
-    """Return the corners (4, 2) px, with their covariance, of the marker whose side is
-    `side_to_large_side_ratio` times the large marker's, projected from the fitted pose. Returns
-    None if a corner is behind the camera or too far from the optical axis for the lens model."""
+    """Return the corners of the marker whose side is `side_to_large_side_ratio` times the large
+    marker's, projected from the fitted pose: (4, 2) px in the distorted image, with their
+    covariance (8, 8) in pixels of a pinhole camera. Returns None if a corner is behind the camera
+    or too far from the optical axis for the lens model."""
     r = (
         np.column_stack([side_to_large_side_ratio * CENTRED_SQUARE, np.zeros(4)])
         @ pose_fit.pose.R_cam_drawing.T
@@ -450,10 +451,10 @@ def render_drawing(
     lattice: CoarseLattice,
     margin_nodes: int = 0,
 ) -> FloatImage:
-    """Return the whiteness, 0 to 1, of the drawing at the lattice's nodes and at `margin_nodes`
-    additional nodes on each side. `H_normalised_drawing` (3, 3) maps the drawing's coordinates to
-    normalised image coordinates; `texture` is the drawing as an image. Beyond the texture,
-    everything is white."""
+    """Return the whiteness (rows, columns), 0 to 1, of the drawing at the lattice's nodes and at
+    `margin_nodes` additional nodes on each side. `H_normalised_drawing` (3, 3) maps the drawing's
+    coordinates, in half sides of the large marker from the target's centre, to normalised image
+    coordinates; `texture` is the drawing as an image. Beyond the texture, everything is white."""
     step = lattice.node_spacing_normalised / _SAMPLES_PER_LATTICE_NODE_AND_AXIS
     start = (
         lattice.first_node_normalised
@@ -492,10 +493,11 @@ class DrawingMatch(NamedTuple):
 def correlate_drawing(
     H_normalised_drawing: Array, texture: DrawingTexture, coarse_image: CoarseUndistortedImage
 ) -> DrawingMatch:
-    """Compare the coarse image with the drawing, which `H_normalised_drawing` (3, 3) maps to
-    normalised image coordinates, at the visible nodes on the paper. The brightness and the contrast
-    of the drawing, each with a gradient across the image, are first fitted to the image. Both
-    results are 0 if fewer than `_MIN_VISIBLE_PAPER_NODES` nodes are visible."""
+    """Compare the coarse image with the drawing, given as an image by `texture`, at the visible
+    nodes on the paper. `H_normalised_drawing` (3, 3) maps the drawing's coordinates, in half sides
+    of the large marker from the target's centre, to normalised image coordinates. The brightness
+    and the contrast of the drawing, each with a gradient across the image, are first fitted to the
+    image. Both results are 0 if fewer than `_MIN_VISIBLE_PAPER_NODES` nodes are visible."""
     lattice = coarse_image.lattice
     rows, columns = np.nonzero(coarse_image.is_visible)
     at = lattice.first_node_normalised + lattice.node_spacing_normalised * np.stack(
@@ -538,7 +540,8 @@ class TargetOutline:
 
     Attributes:
         points_half_sides, drawing_normal_to_white: points (n, 2), in half sides of the large marker
-            from the target's centre, and unit normals (n, 2) from black to white.
+            from the target's centre (x right, y down on the paper), and unit normals (n, 2) from
+            black to white.
         line_index: index (n,) of the straight line that each point is on.
         print_error_sigma_half_sides: standard deviation (n,) of the print error of that line.
         adjacent_cell_width_half_sides: width (n,) of the adjacent cell.
@@ -555,7 +558,8 @@ class TargetOutline:
 
 class DrawingTexture(NamedTuple):
     """The target and its white paper as a texture: `whiteness` (m, m), 0 to 1, and the homography
-    `H_pixels_drawing` (3, 3) from the drawing's coordinates to the texture's pixels."""
+    `H_pixels_drawing` (3, 3) from the drawing's coordinates, in half sides of the large marker from
+    the target's centre, to the texture's pixels."""
 
     whiteness: FloatImage
     H_pixels_drawing: Array
@@ -565,9 +569,11 @@ class DrawingTexture(NamedTuple):
 def make_outline(
     drawing: MarkerDrawing, large_print_tolerance_cells: float, small_print_tolerance_cells: float
 ) -> TargetOutline:
-    """Return the black-white edges of both markers as points. Edges of the large marker that may be
-    hidden by the small one are omitted. The tolerances are standard deviations of the position of a
-    printed edge, in cells of the marker."""
+    """Return the black-white edges of both markers as points, in half sides of the large marker
+    from the target's centre (x right, y down on the paper). `drawing` is that of the large marker,
+    with the small one in it. Edges of the large marker that may be hidden by the small one are
+    omitted. The tolerances are standard deviations of the position of a printed edge, in cells of
+    the large and of the small marker."""
     hidden = _SMALL_MARKER_OCCLUSION_REACH_HALF_SIDES * drawing.small_to_large_side_ratio
     edges = [
         edge
@@ -602,7 +608,7 @@ def make_outline(
 @lru_cache(maxsize=8)
 def make_drawing_texture(drawing: MarkerDrawing) -> DrawingTexture:
     """Render the target and its white paper, out to `PAPER_REACH_LARGE_MARKER_HALF_SIDES` from the
-    centre."""
+    centre. `drawing` is that of the large marker, with the small one in it."""
     axis = make_sampling_grid(
         _TEXTURE_SIZE_PX, PAPER_REACH_LARGE_MARKER_HALF_SIDES
     ).node_positions_half_sides
@@ -697,14 +703,16 @@ _POSE_PRIOR_INFORMATION_DIAGONAL: Array = (
 @dataclass(frozen=True, eq=False)
 class RigidPose:
     """Pose of the drawing in the camera frame: rotation `R_cam_drawing` (3, 3), and translation
-    `t_cam_drawing_half_sides` (3,) in half sides of the large marker."""
+    `t_cam_drawing_half_sides` (3,) in half sides of the large marker. The drawing's origin is the
+    target's centre; its axes are x right and y down on the paper, and z into the paper."""
 
     R_cam_drawing: Array
     t_cam_drawing_half_sides: Array
 
     @property
     def H_normalised_drawing(self) -> Array:
-        """Homography (3, 3) from the drawing's coordinates to normalised image coordinates."""
+        """Homography (3, 3) from the drawing's coordinates, in half sides of the large marker from
+        the target's centre, to normalised image coordinates."""
         return np.column_stack(
             [self.R_cam_drawing[:, 0], self.R_cam_drawing[:, 1], self.t_cam_drawing_half_sides]
         )
@@ -715,7 +723,7 @@ class PoseFit:
     """A fitted pose and its quality.
 
     Attributes:
-        pose: the pose of the drawing.
+        pose: the pose of the drawing in the camera frame.
         rotation_translation_cov: covariance (6, 6) of small rotations about (rad) and translations
             along (half sides of the large marker) the camera's x, y, z.
         visible_point_count: number of edge points of the drawing that are in the image.
@@ -737,11 +745,11 @@ class _EdgePoints:
     """Those edge points of a target outline that are in the image.
 
     Attributes:
-        points_px, image_normal_to_white: points (n, 2) px, and unit normals (n, 2) from black to
-            white.
+        points_px, image_normal_to_white: points (n, 2) px in the distorted image, and unit normals
+            (n, 2) from black to white.
         normal_motion_jacobian: derivative (n, 7) of each point's motion along its normal with
-            respect to rotation (rad), translation (half sides) and the shift of all edges (px,
-            white over black).
+            respect to rotation about (rad) and translation along (half sides of the large marker)
+            the camera's axes, and the shift of all edges (px, white over black).
         px_per_half_side: image scale (n,) across the edge at each point.
         outline_point_index: index (n,) of each point in the outline.
     """
@@ -826,8 +834,8 @@ def fit_pose(
 def predict_fit_accuracy(
     pose: RigidPose, outline: TargetOutline, camera: CameraModel
 ) -> PoseFit | None:
-    """Return the covariance and point counts that `fit_pose` would report for an ideal image taken
-    from `pose`; None if too little of the target is visible."""
+    """Return the covariance and point counts that `fit_pose` would report for an ideal image of the
+    drawing at `pose` in the camera frame; None if too little of the target is visible."""
     edge_points = _edge_points_in_view(
         pose, outline, _PROFILE_HALF_LENGTH_PER_ITERATION_PX[0], camera.size_px[::-1], camera, None
     )

@@ -371,7 +371,8 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
 
 def find_corners(detector_input: DetectorInput, prior: DetectionPrior) -> CornerResults:
     """Find the markers' corners with each applicable method of `CORNER_METHODS` in turn. Each
-    method starts from the results of the methods before it.
+    method starts from the results of the methods before it. The result has no corners if no method
+    finds a marker.
     """
     found = CornerResults()
     for method in CORNER_METHODS:
@@ -391,10 +392,10 @@ def detect_markers(
 ) -> Detections:
     """Find and refine the target's markers in one frame.
 
-    The search starts at `expected_corners_px`, each (4, 2), predicted from the vehicle's motion, or
-    otherwise near the `previous` detections. The kinds of search alternate depending on
-    `frames_without_markers`, the number of successive frames without a marker. If it is None, as
-    for the first frame, all kinds of search are used. If no target is expected,
+    The search starts at `expected_corners_px`, each (4, 2) in the distorted image, predicted from
+    the vehicle's motion, or otherwise near the `previous` detections. The kinds of search alternate
+    depending on `frames_without_markers`, the number of successive frames without a marker. If it
+    is None, as for the first frame, all kinds of search are used. If no target is expected,
     `measure_marker_to_own_target_distance_m` chooses one of several targets. For a frame of two
     fields, the result is the mean of the fields.
     """
@@ -757,8 +758,9 @@ def fit_lines(
     start_corners_px: Mapping[MarkerName, Array],
     known_edge_shift: EdgeShift | None = None,
 ) -> _FoundCorners:
-    """Fit the four sides of each marker, starting at `start_corners_px` (4, 2), and return the
-    markers whose four sides are straight. This function does not check the cells.
+    """Fit the four sides of each marker, starting at `start_corners_px` (4, 2) in the distorted
+    image, and return the markers whose four sides are straight. This function does not check the
+    cells.
 
     All markers are fitted together, because blooming and gamma move all edges of an image by the
     same number of pixels. `known_edge_shift` is how far white has grown over black, if this was
@@ -813,11 +815,12 @@ def add_partly_visible_markers(
     found_corners: _FoundCorners,
     known_edge_shift: EdgeShift | None = None,
 ) -> _FoundCorners:
-    """Return the markers in `found_corners`, plus each expected marker that could be fitted to its
-    visible part.
+    """Return the markers in `found_corners`, plus each marker in `expected_corners_px`, (4, 2)
+    each, that could be fitted to its visible part.
 
-    If the small marker was found, the large one is expected around it. `known_edge_shift` is how
-    far white has grown over black at all edges; None measures it.
+    If the small marker was found, the large one is expected around it. If only the large marker is
+    found, the small one is derived from it and added if the image resembles it. `known_edge_shift`
+    is how far white has grown over black at all edges; None measures it.
     """
     start_corners_px, found_corners = dict(expected_corners_px), dict(found_corners)
     if "small" in found_corners and "large" not in found_corners:

@@ -159,8 +159,9 @@ _MEAN_GREY_WEIGHT_IN_FILL = 1e-4
 
 
 def make_hidden_mask(frame: Frame, static_hidden_mask: HiddenMask | None) -> HiddenMask | None:
-    """Return the mask (h, w) of the pixels that the vehicle hides in this frame. For a single
-    field, `static_hidden_mask` is extended by the rows that are interpolated from hidden ones."""
+    """Return the mask (h, w) of the pixels that the vehicle hides in this frame (True); None if
+    `static_hidden_mask` is None. For a single field, `static_hidden_mask` is extended by the rows
+    that are interpolated from hidden ones."""
     if static_hidden_mask is None or frame.picture_kind not in ("top", "bottom"):
         return static_hidden_mask
     return (
@@ -172,8 +173,8 @@ def make_hidden_mask(frame: Frame, static_hidden_mask: HiddenMask | None) -> Hid
 
 
 def fill_hidden_pixels(image: NDArray[np.uint8], hidden_mask: HiddenMask) -> NDArray[np.uint8]:
-    """Return the image after filling its hidden pixels with a smooth interpolation of their
-    surroundings."""
+    """Return the image (h, w) after filling the pixels at which `hidden_mask` (h, w) is True with a
+    smooth interpolation of their surroundings."""
     h, w = image.shape
     free = (~hidden_mask).astype(np.float32)
     size = (max(w // _FILL_REDUCTION, 1), max(h // _FILL_REDUCTION, 1))
@@ -195,8 +196,9 @@ def is_any_marker_part_hidden(
     corners_px: Array,
     reach_half_sides: float = WHITE_BORDER_REACH_HALF_SIDES,
 ) -> bool:
-    """True if the vehicle hides any pixel near the marker: within the square that extends
-    `reach_half_sides` half sides from its centre. `hidden_mask` is True for hidden pixels."""
+    """True if the vehicle hides any pixel near the marker with `corners_px` (4, 2) in the image:
+    within the square that extends `reach_half_sides` half sides from its centre. `hidden_mask` (h,
+    w) is True for hidden pixels; without a mask, the result is False."""
     if hidden_mask is None:
         return False
     h, w = hidden_mask.shape
@@ -217,7 +219,8 @@ def is_any_marker_part_hidden(
 @dataclass(frozen=True, eq=False)
 class DetectorInput:
     """An image in which markers are to be detected, together with the detector setup and the
-    camera. `hidden_mask` (h, w) is True for pixels that the vehicle hides."""
+    camera. `hidden_mask` (h, w) is True for pixels that the vehicle hides; None if it hides
+    none."""
 
     image: NDArray[np.uint8]
     hidden_mask: HiddenMask | None
@@ -228,7 +231,7 @@ class DetectorInput:
         self, other_corners_px: Array, derived_name: MarkerName
     ) -> Array:
         """Return the corners (4, 2) px of the marker `derived_name`, derived from
-        `other_corners_px` (4, 2) of the other marker."""
+        `other_corners_px` (4, 2) of the other marker, both in the distorted image."""
         side_ratio = (
             self.setup.small_to_large_side_ratio
             if derived_name == "small"

@@ -105,13 +105,15 @@ def make_side_profiles(
     fractions_along_side: Array,
     camera: CameraModel,
 ) -> tuple[Array, Array]:
-    """Return the points, px, at which the profiles cross the sides, and the unit normals at these
-    points; both (rows, n, 2). Seen from the start of a side towards its end, the normals point to
-    the left in the image, which is outwards for a marker with clockwise corners.
+    """Return the points, px in the distorted image, at which the profiles cross the sides, and the
+    unit normals at these points; both (rows, n, 2). Seen from the start of a side towards its end,
+    the normals point to the left in the image, which is outwards for a marker with clockwise
+    corners.
 
-    `side_starts_normalised`, `side_ends_normalised` (rows, 2) are the normalised ends of the sides;
-    `fractions_along_side` (rows, n) come from `profile_fractions_along_side`. The image of a side
-    through the lens is a smooth curve, so it is computed at five points and interpolated."""
+    `side_starts_normalised`, `side_ends_normalised` (rows, 2) are the ends of the sides in
+    normalised image coordinates; `fractions_along_side` (rows, n) come from
+    `profile_fractions_along_side`. The image of a side through the lens is a smooth curve, so it is
+    computed at five points and interpolated."""
     first, last = fractions_along_side[:, :1], fractions_along_side[:, -1:]
     at = (0.5 * (first + last) + (0.5 * (last - first)) * _NODE_POSITIONS_ALONG_SIDE)[..., None]
     points = (
@@ -226,12 +228,14 @@ def refine_corners_by_lines(
     camera: CameraModel,
     known_edge_shift: EdgeShift | None = None,
 ) -> list[RefinedCorners | None]:
-    """Fit lines to the sides of m markers with corners (m, 4, 2) px and intersect them to get
-    refined corners. The result for a marker is None if not all four of its sides were found.
+    """Fit lines to the sides of m markers with corners (m, 4, 2) px in the distorted image and
+    intersect them to get refined corners. The result for a marker is None if not all four of its
+    sides were found.
 
     `cells_along_border` describes the cells just inside each marker's border. The common shift of
-    all edges is measured unless the caller passes `known_edge_shift`. If a marker's edges are wide
-    or near the ends of the profiles, the fit is repeated with the profiles centred on the edges.
+    all edges (growth of white over black) is measured unless the caller passes `known_edge_shift`
+    and white is not clipped. If a marker's edges are wide or near the ends of the profiles, the fit
+    is repeated with the profiles centred on the edges.
     """
     found = _refine_lines_once(image, raw_corners_px, cells_along_border, camera, known_edge_shift)
     centred = raw_corners_px.copy()
@@ -457,7 +461,8 @@ def _side_bow_px(
     """Return the bow of the sides of the marker with the widest cells: by how much, px, their ends
     are further out than their middles. A parabola is fitted to the distances of each side's edge
     points from its line, and the bow is the mean over the four sides. The result is 0 if it is not
-    significant compared with the noise `rms_residual_px` (4m,)."""
+    significant compared with the noise. `line_nx_ny_c` (4m, 3) and `rms_residual_px` (4m,) are the
+    results of `_fit_lines`."""
     four = slice(4 * markers.widest_marker_index, 4 * markers.widest_marker_index + 4)
     away = (
         np.matmul(outer_edges.points_normalised[four], line_nx_ny_c[four, :2, None])[..., 0]
@@ -610,8 +615,9 @@ class EdgeData:
 def prepare_marker_sides(
     raw_corners_px: Array, cells_along_border: Sequence[CellsAlongBorder], camera: CameraModel
 ) -> MarkerSides | None:
-    """Return the sides of markers with corners (m, 4, 2) px; None if one of them is not a
-    quadrilateral or the lens model has no solution for a corner."""
+    """Return the sides of markers with corners (m, 4, 2) px in the distorted image.
+    `cells_along_border` describes the cells just inside each marker's border. Returns None if one
+    of the markers is not a quadrilateral or the lens model has no solution for a corner."""
     sides_px = side_lengths_px(raw_corners_px)
     cells = np.array([rim.cells_per_side for rim in cells_along_border], dtype=np.float64)
     corners = undistort_to_normalised(raw_corners_px.reshape(-1, 2), camera).reshape(
@@ -702,8 +708,8 @@ def measure_edges(
 
 
 def window_and_profile_half_lengths_px(cell_size_px: Array) -> tuple[Array, Array]:
-    """Return two half lengths, px, for cells of the given size: of the windows around edges, and of
-    the profiles."""
+    """Return two half lengths, px, for each of the given cell sizes (n,): of the windows around
+    edges, and of the profiles across them."""
     window_half_length_px = np.minimum(np.maximum(0.85 * cell_size_px, 1.5), 7.0)
     return window_half_length_px, np.minimum(np.maximum(1.5 * cell_size_px, 1.75), 7.0)
 
@@ -818,15 +824,15 @@ def locate_edges(
     neighbours: NeighbourEdges,
 ) -> tuple[Array, Array, Array]:
     """Locate the dark-to-bright edge on each profile. Return each edge's offset from the middle of
-    the profile, px (rows, n); its weight (rows, n), 0 for outliers; and the standard deviation of
-    the blur in each row, px (rows,).
+    the profile, px (rows, n), positive towards the bright end; its weight (rows, n), 0 for
+    outliers; and the standard deviation of the blur in each row, px (rows,).
 
     An edge is the centroid of the grey gradient under a Gaussian window, first a wide one around
     the middle of the profile and then a narrow one around the line fitted to all profiles of a row.
 
     Args:
         profile_greys: grey values (rows, n, steps + 1) along each profile, from
-            -profile_half_length_px to +profile_half_length_px.
+            -profile_half_length_px (dark) to +profile_half_length_px (bright).
         profile_half_length_px, window_half_length_px: half length of the profiles and of the
             windows, (rows,).
         neighbours: parallel edges whose blur moves the measured edges; this is corrected.
@@ -891,8 +897,8 @@ class _EdgeProfiles:
     def locate_in_wide_window(self) -> tuple[Floats, NDArray[np.bool_]]:
         """Locate the edge on each profile at the centroid of the grey gradient under a wide
         Gaussian window around the middle of the profile. Return the edge offsets from the middle,
-        px (rows, n), and whether each profile is usable (rows, n): whether its gradient is strong
-        enough."""
+        px (rows, n), positive towards the bright end, and whether each profile is usable (rows, n):
+        whether its gradient is strong enough."""
         spread = self.u * (_WIDE_WINDOW_HALF_LENGTH_PER_WINDOW_SIGMA / self.near)[:, None]
         spread *= spread
         window = np.empty((*self.u.shape, 2), dtype=np.float32)
@@ -907,10 +913,11 @@ class _EdgeProfiles:
         self, line_offsets_px: Floats, blur_variance_px2: Floats
     ) -> tuple[Floats, NDArray[np.bool_], Floats]:
         """Locate the edge on each profile again, with a narrow Gaussian window around the side's
-        line at `line_offsets_px` (rows, n). `blur_variance_px2` (rows,), the previous estimate of
-        the blur, sets the width of the window. The centroid of the gradient is corrected for the
-        window and for neighbouring edges. Return the edge offsets, px (rows, n), whether each
-        profile is usable (rows, n), and the variance of the blur, px^2 (rows,)."""
+        line at `line_offsets_px` (rows, n) from the middle of the profiles. `blur_variance_px2`
+        (rows,), the previous estimate of the blur, sets the width of the window. The centroid of
+        the gradient is corrected for the window and for neighbouring edges. Return the edge offsets
+        from the middle, px (rows, n), positive towards the bright end, whether each profile is
+        usable (rows, n), and the variance of the blur, px^2 (rows,)."""
         relative = self.u[:, None, :] - line_offsets_px[:, :, None]
         # The second moment under a Gaussian window w is m2 with 1/m2 = 1/blur^2 + 1/w^2.
         w2 = np.minimum(
@@ -952,9 +959,9 @@ class _EdgeProfiles:
 def _fit_line_to_half_side_midmeans(
     edge_offsets_px: Floats, is_usable: NDArray[np.bool_]
 ) -> Floats:
-    """Fit a line to each side through the midmeans (the means of the middle 50 %) of the offsets in
-    both halves of its profiles. Up to a quarter of the profiles in each half may be outliers.
-    Returns the line's offsets (rows, n)."""
+    """Fit a line to each side through the midmeans (the means of the middle 50 %) of the usable
+    edge offsets, px (rows, n), in both halves of its profiles. Up to a quarter of the profiles in
+    each half may be outliers. Returns the line's offset on each profile, px (rows, n)."""
     halves = np.where(is_usable, edge_offsets_px, _MEDIAN_PRESERVING_FILL_PX).reshape(
         -1, 2, 2 * _PROFILES_PER_QUARTER_SIDE
     )
@@ -974,7 +981,7 @@ def _fit_robust_line(
 ) -> tuple[Floats, Floats]:
     """Fit a straight line to the usable edge offsets of each side, px (rows, n), by least squares
     with Tukey's biweight: starting at the median, the line is fitted `iterations` times. Return the
-    line's offsets and the weights, both (rows, n)."""
+    line's offset on each profile, px, and the weights, both (rows, n)."""
     line = median_per_row(edge_offsets_px, is_usable)[:, None]
     for _ in range(iterations):
         size = np.abs(edge_offsets_px - line)

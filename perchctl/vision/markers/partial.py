@@ -89,8 +89,8 @@ def fit_partly_visible_marker(
     identified_by: IdentificationEvidence,
     known_edge_shift: EdgeShift | None = None,
 ) -> RefinedCorners | None:
-    """Fit a marker to its visible part, starting at `start_corners_px` (4, 2). Corners may be
-    outside the image.
+    """Fit a marker to its visible part, starting at `start_corners_px` (4, 2) in the distorted
+    image. Corners may be outside the image.
 
     `identified_by` is the evidence for the marker's identity: its own cells alone ("bits"), the
     predicted position ("track") or the other marker ("other_marker"). This evidence determines how
@@ -148,7 +148,8 @@ def fit_partly_visible_marker(
 
 
 def is_fully_visible(detector_input: DetectorInput, corners: RefinedCorners) -> bool:
-    """True if no part of the marker is hidden or outside the image."""
+    """True if no part of the marker is hidden and all its corners are inside the image, at least
+    `IMAGE_BORDER_MARGIN_PX` plus the standard deviation of the blur away from its border."""
     margin_px = IMAGE_BORDER_MARGIN_PX + corners.blurriest_side_blur_sigma_px
     return is_inside_image(
         corners.corners_px, detector_input.image.shape, margin_px
@@ -204,11 +205,13 @@ def _make_refined_corners(
     pattern: MarkerPattern,
     camera: CameraModel,
 ) -> RefinedCorners | None:
-    """Return the marker's corners, projected by `H_pinhole_marker` (3, 3), with their covariance.
-    `residual_px` (rows, n) are the residuals of the edges after the fit, and `normal_matrix` (9, 9)
-    is the normal matrix of the last step. Returns None if the blur fills a window, if the RMS
-    residual is above `_MAX_EDGE_FIT_RMS_RESIDUAL_PX`, or if the standard deviation of a corner is
-    above `_MAX_CORNER_SIGMA_SIDES` side lengths."""
+    """Return the marker's corners (4, 2) px in the distorted image, with their covariance (8, 8) in
+    pixels of a pinhole camera. `H_pinhole_marker` (3, 3) projects the marker's coordinates, in half
+    sides from its centre, to pixels of that pinhole camera. `residual_px` (rows, n) are the
+    residuals of the edges after the fit, and `normal_matrix` (9, 9) is the normal matrix of the
+    last step. Returns None if the blur fills a window, if the RMS residual is above
+    `_MAX_EDGE_FIT_RMS_RESIDUAL_PX`, or if the standard deviation of a corner is above
+    `_MAX_CORNER_SIGMA_SIDES` side lengths."""
     w = visible_edges.weight
     mass = w.sum(axis=1)
     used = mass > 0.0
@@ -278,10 +281,11 @@ def _has_matching_visible_cells(
     pattern: MarkerPattern,
     identified_by: IdentificationEvidence,
 ) -> bool:
-    """True if the visible cells, apart from those with glare, have the right colours. The number of
-    inner cells that may be invisible depends on `identified_by`: one for "bits", four for "track",
-    any number for "other_marker". For "other_marker", a fifth of the visible inner cells may also
-    have the wrong colour."""
+    """True if the visible cells of a marker with corners (4, 2) px in the distorted image, apart
+    from those with glare, have the right colours. The number of inner cells that may be invisible
+    depends on `identified_by`: one for "bits", four for "track", any number for "other_marker". For
+    "other_marker", a fifth of the visible inner cells may also have the wrong colour. False if the
+    contrast is too low or too few cells are visible."""
     image, hidden_mask = detector_input.image, detector_input.hidden_mask
     h, w = image.shape
     at = _project_sample_points_px(corners_px, pattern, detector_input.camera)
@@ -322,9 +326,9 @@ def _has_matching_visible_cells(
 def _project_sample_points_px(
     corners_px: Array, pattern: MarkerPattern, camera: CameraModel
 ) -> Array:
-    """Return the sample points (n, 2), px in the distorted image, of a marker with corners (4, 2);
-    NaN outside the valid range of the lens model. The distortion matters here because a marker that
-    fills the image does not appear as a quadrilateral."""
+    """Return the pattern's sample points (n, 2) for a marker with `corners_px` (4, 2), both in
+    pixels of the distorted image; NaN outside the valid range of the lens model. The distortion
+    matters here because a marker that fills the image does not appear as a quadrilateral."""
     rays = undistort_to_normalised(corners_px, camera)
     if not np.isfinite(rays).all():
         return np.full((len(pattern.sample_points_half_sides), 2), np.nan)
@@ -342,8 +346,8 @@ def _project_sample_points_px(
 def _is_point_in_image(
     points_px: Array, shape: tuple[int, ...], max_distance_outside_px: float
 ) -> NDArray[np.bool_]:
-    """Return for each point (n, 2) whether it is in the image, or outside it by at most
-    `max_distance_outside_px`."""
+    """Return for each point (n, 2) whether it is in an image with the given `shape` (h, w), or
+    outside it by at most `max_distance_outside_px`."""
     h, w = shape[:2]
     inside = (points_px >= -max_distance_outside_px) & (
         points_px <= (w - 1 + max_distance_outside_px, h - 1 + max_distance_outside_px)
@@ -355,7 +359,7 @@ def _is_cell_visible(
     is_sample_visible: NDArray[np.bool_], pattern: MarkerPattern
 ) -> NDArray[np.bool_]:
     """Return for each cell (cells,) whether at least half of its sample points are visible, given
-    `is_sample_visible` (n,)."""
+    `is_sample_visible` (n,), one value for each of the pattern's sample points."""
     is_known: NDArray[np.bool_] = (
         np.bincount(pattern.sample_cell_index, weights=is_sample_visible)
         >= 0.5 * pattern.samples_per_cell
@@ -427,9 +431,9 @@ def find_visible_edges(
     detector_input: DetectorInput, H_pinhole_marker: Array, pattern: MarkerPattern
 ) -> VisibleEdges | None:
     """Measure the visible edges of a marker: its sides and, if its cells are large enough, the
-    inner edges of its border. `H_pinhole_marker` (3, 3) projects the marker's coordinates to pixels
-    of a pinhole camera. Returns None if fewer than `_MIN_VISIBLE_EDGES` edges are visible, or if
-    they have too little contrast."""
+    inner edges of its border. `H_pinhole_marker` (3, 3) projects the marker's coordinates, in half
+    sides from its centre, to pixels of a pinhole camera. Returns None if fewer than
+    `_MIN_VISIBLE_EDGES` edges are visible, or if they have too little contrast."""
     camera, cells, corners = (
         detector_input.camera,
         pattern.cells_along_border.cells_per_side,

@@ -62,8 +62,9 @@ class MarkerPattern:
     Attributes:
         cells_along_border: the cells just inside the border.
         drawing: all cells of the marker.
-        sample_points_half_sides: points (n, 2) at which the greys of cells are read, in the
-            marker's coordinates (see `perchctl.vision.markers.corners`).
+        sample_points_half_sides: points (n, 2) at which the greys of cells are read, in half sides
+            from the marker's centre (x right, y down on the paper). The cells below are those that
+            have sample points.
         sample_cell_index: the cell (n,) of each sample point.
         samples_per_cell: number of sample points in each cell, (cells,).
         rotated_sample_templates: expected grey (4, n) at the sample points, one row for each
@@ -107,8 +108,10 @@ def make_cells_along_border(
 def make_marker_pattern(
     cells_along_border: CellsAlongBorder, drawing: MarkerDrawing
 ) -> MarkerPattern:
-    """Return a marker's pattern, with sample points in all cells that are not covered by a small
-    marker in the centre."""
+    """Return the pattern of a marker with the given `drawing`. Its sample points, in half sides
+    from the marker's centre, are in all cells, except where a small marker in the centre covers
+    them. `cells_along_border`, the cells just inside the border (`make_cells_along_border`),
+    becomes a part of the pattern."""
     n = len(drawing.cell_whiteness)
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
     x, y = np.meshgrid(middle, middle)
@@ -140,10 +143,10 @@ def make_marker_pattern(
 
 
 def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern) -> bool:
-    """True if every cell of a marker with corners (4, 2) px clearly has the colour of its cell in
-    the pattern: its mean grey is on the right side of the middle between the medians of black and
-    white, by at least `MIN_CELL_MARGIN_TO_CONTRAST_RATIO` of the contrast. False if the contrast is
-    below `MIN_CONTRAST_GREY` or the marker is partly outside the image."""
+    """True if every cell of a marker with corners (4, 2) px in the image clearly has the colour of
+    its cell in the pattern: its mean grey is on the right side of the middle between the medians of
+    black and white, by at least `MIN_CELL_MARGIN_TO_CONTRAST_RATIO` of the contrast. False if the
+    contrast is below `MIN_CONTRAST_GREY` or the marker is partly outside the image."""
     means = _mean_grey_per_cell(image, corners_px, pattern)
     if means is None:
         return False
@@ -164,8 +167,8 @@ def has_mostly_matching_cells(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> bool:
     """True if more than `MIN_MATCHING_CELL_FRACTION` of the cells of a marker with corners (4, 2)
-    px have the colour of their cell in the pattern: their mean grey is on the right side of the
-    middle between the medians of black and white. False if the contrast is below
+    px in the image have the colour of their cell in the pattern: their mean grey is on the right
+    side of the middle between the medians of black and white. False if the contrast is below
     `MIN_CONTRAST_GREY` or the marker is partly outside the image."""
     means = _mean_grey_per_cell(image, corners_px, pattern)
     if means is None:
@@ -178,8 +181,9 @@ def has_mostly_matching_cells(
 def is_correlated_with_pattern(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> bool:
-    """True if the grey values in the cells of a marker with corners (4, 2) px, without rotation of
-    the marker, have a correlation of more than `_MIN_PATTERN_CORRELATION` with the pattern."""
+    """True if the grey values in the cells of a marker with corners (4, 2) px in the image, without
+    rotation of the marker, have a correlation of more than `_MIN_PATTERN_CORRELATION` with the
+    pattern. False if the marker is partly outside the image."""
     return (
         float(correlate_pattern_rotations(image, corners_px, pattern)[0]) > _MIN_PATTERN_CORRELATION
     )
@@ -189,8 +193,8 @@ def correlate_pattern_rotations(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> Array:
     """Return the correlation (4,) of the grey values in the cells with the pattern, for the four
-    rotations of the marker (corners (4, 2) px rolled by 0 to 3); 0 if there is no contrast or the
-    marker is partly outside the image."""
+    rotations of the marker (corners (4, 2) px in the image, rolled by 0 to 3 as by `np.roll`); 0 if
+    there is no contrast or the marker is partly outside the image."""
     grey = _read_sample_greys(image, corners_px, pattern)
     if grey is None:
         return np.zeros(4)
@@ -216,8 +220,9 @@ def _mean_grey_per_cell(
 def _read_sample_greys(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> Array | None:
-    """Return the grey values (k,) of the pixels nearest to the pattern's sample points in a marker
-    with corners (4, 2) px; None if any of them is outside the image."""
+    """Return the grey values (n,) of the pixels nearest to the pattern's sample points in a marker
+    with corners (4, 2) px in the image, ignoring lens distortion between the corners; None if any
+    of them is outside the image."""
     at = apply_homography(
         homography_from_centred_square(corners_px), pattern.sample_points_half_sides
     )
@@ -229,8 +234,9 @@ def _read_sample_greys(
 
 
 def _sample_blurred_drawing(drawing: MarkerDrawing, sample_points_half_sides: Array) -> Array:
-    """Return the whiteness (k,), 0 to 1, of the drawing at the sample points (k, 2) after a blur
-    with a standard deviation of half a cell. The small marker is not drawn."""
+    """Return the whiteness (k,), 0 to 1, of the drawing at the sample points (k, 2), in half sides
+    from the marker's centre, after a blur with a standard deviation of half a cell. The small
+    marker is not drawn."""
     n, fine = len(drawing.cell_whiteness), 8
     sharp_nodes = np.kron(
         np.pad(drawing.cell_whiteness, 2, constant_values=1.0), np.ones((fine, fine))
@@ -274,8 +280,10 @@ def make_marker_drawing(
     small_marker_bits: NDArray[np.uint8] | None = None,
     small_to_large_side_ratio: float = 0.0,
 ) -> MarkerDrawing:
-    """Return the drawing of a marker with inner bits `bits`, 1 = white. `small_marker_bits` and
-    `small_to_large_side_ratio` describe the small marker in its centre, if any."""
+    """Return the drawing of a marker with inner bits `bits` (n, n), 1 = white, to which a black
+    border is added. `small_marker_bits` (m, m) and `small_to_large_side_ratio`, the side of the
+    small marker divided by the side of the large one, describe the small marker in its centre, if
+    any; the paper then ends one cell outside the border."""
     cells = np.pad(bits.astype(np.float64), 1)
     if small_marker_bits is None:
         return MarkerDrawing(cells)
@@ -350,8 +358,8 @@ def render_whiteness_and_off_paper_fraction(
 @lru_cache(maxsize=64)
 def render_black_square(cells_per_side: int, nodes_per_side: int) -> NDArray[np.float32]:
     """Return the whiteness of a black square on white paper, with the size of a marker that has
-    `cells_per_side` cells, at n by n nodes (`nodes_per_side`) and at a margin of nodes around them,
-    as in `render_whiteness_and_off_paper_fraction`."""
+    `cells_per_side` cells, including the border, at n by n nodes (`nodes_per_side`) and at a margin
+    of nodes around them, as in `render_whiteness_and_off_paper_fraction`."""
     return render_whiteness_and_off_paper_fraction(
         MarkerDrawing(np.zeros((cells_per_side, cells_per_side))), nodes_per_side
     )[0]
@@ -360,10 +368,11 @@ def render_black_square(cells_per_side: int, nodes_per_side: int) -> NDArray[np.
 def render_cells(
     drawing: MarkerDrawing, node_positions_half_sides: Array, node_reach_half_sides: float
 ) -> NDArray[np.float32]:
-    """Return the whiteness, 0 to 1, at the nodes of a square grid with the coordinates
-    `node_positions_half_sides` along both axes, extended by `BLUR_MARGIN_NODES` nodes on all sides.
-    It is the mean over each node's square, which extends `node_reach_half_sides`, half the spacing,
-    to each side. The surroundings of the marker are white."""
+    """Return the whiteness of the drawing, 0 to 1, at the nodes of a square grid with the
+    coordinates `node_positions_half_sides` along both axes, in half sides from the marker's centre,
+    extended by `BLUR_MARGIN_NODES` nodes on all sides. It is the mean over each node's square,
+    which extends `node_reach_half_sides`, half the spacing, to each side. The surroundings of the
+    marker are white."""
     wide = _add_margin_nodes(node_positions_half_sides, node_reach_half_sides)
     C = _cell_coverage(wide, node_reach_half_sides, len(drawing.cell_whiteness), 1.0)
     black = C @ (1.0 - drawing.cell_whiteness) @ C.T
@@ -408,7 +417,8 @@ def blurred_cell_coverage(
 
 
 def blur_nodes(sharp_nodes: NDArray[np.float32], blur_sigma_nodes: float) -> NDArray[np.float32]:
-    """Return the node values after a Gaussian blur with the standard deviation `blur_sigma_nodes`.
-    Both the input and the result have a margin of `BLUR_MARGIN_NODES` nodes on all sides."""
+    """Return the node values after a Gaussian blur with the standard deviation `blur_sigma_nodes`,
+    in node spacings. Both the input and the result have a margin of `BLUR_MARGIN_NODES` nodes on
+    all sides."""
     soft = cv2.GaussianBlur(sharp_nodes, (0, 0), blur_sigma_nodes, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(soft, np.float32)

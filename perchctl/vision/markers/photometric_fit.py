@@ -98,7 +98,8 @@ class DrawingAlignment:
     """Result of fitting a drawing to the image, with measures of the fit's quality.
 
     Attributes:
-        corners_px, sigma_px: the marker's corners (4, 2) and their standard deviation.
+        corners_px, sigma_px: the marker's corners (4, 2) in the distorted image, and their standard
+            deviation.
         fit_correlation: correlation of the image with the fitted drawing.
         pattern_correlation: correlation of the inner bits with the residual that a plain black
             square of the same size leaves in the image.
@@ -157,8 +158,9 @@ def align_drawing(
     initial_blur_sigma_px: float = 1.0,
 ) -> DrawingAlignment | None:
     """Fit the drawing to the image by Gauss-Newton iterations, starting at `start_corners_px` (4,
-    2) and `initial_blur_sigma_px`. The unknowns are the homography of the marker, the variance of
-    the blur, and the illumination that converts the drawing to grey values.
+    2) in the distorted image and at a blur with the standard deviation `initial_blur_sigma_px`. The
+    unknowns are the homography of the marker, the variance of the blur, and the illumination that
+    converts the drawing to grey values.
 
     Returns None if a part of the marker is outside the image, if the image does not resemble the
     drawing, or if the fit diverges.
@@ -397,7 +399,8 @@ def _assign_nodes_to_cells(
     grid: SamplingGrid, cells_per_side: int
 ) -> tuple[NDArray[np.intp], Array]:
     """Return the index (n * n,) of the cell, row by row, that contains each node, and the number of
-    nodes in each cell, at least 1. The index of nodes outside the marker is the number of cells."""
+    nodes in each cell, at least 1. The index of nodes outside the marker is the number of cells.
+    `cells_per_side` includes the border."""
     x, y = (grid.node_uv1[:2] + 1.0) * 0.5 * cells_per_side
     inside = (x >= 0) & (x < cells_per_side) & (y >= 0) & (y < cells_per_side)
     own = y.astype(np.intp) * cells_per_side + x.astype(np.intp)
@@ -413,8 +416,8 @@ def _assign_nodes_to_cells(
 
 def _illuminated_jacobian(drawing: RenderedDrawing, illumination: Array) -> Array:
     """Return the derivatives (9, n * n) of the drawing's grey values with respect to the increment
-    of the homography (8) and the variance of the blur. The illumination is given by the
-    coefficients `illumination` (7 or 8,), one per row of `illumination_basis`."""
+    of the homography (8) and the variance of the blur, in squared node spacings. The illumination
+    is given by the coefficients `illumination` (7 or 8,), one per row of `illumination_basis`."""
     contrast_grey, (u, v, _) = float(illumination[GAIN]), drawing.grid.node_uv1
     (white, changes), *others = drawing.blurred_whiteness_and_off_paper_fraction
     bend = min(max(float(illumination[BEND]) / contrast_grey, -0.9), 0.9)
@@ -445,8 +448,9 @@ class SamplingGrid:
 
 @lru_cache(maxsize=64)
 def make_sampling_grid(nodes_per_side: int, grid_reach_half_sides: float) -> SamplingGrid:
-    """Return a grid over the square from -grid_reach_half_sides to grid_reach_half_sides, with one
-    node in the middle of each of its n by n equal parts."""
+    """Return a grid over the square from -grid_reach_half_sides to grid_reach_half_sides around the
+    marker's centre, with one node in the middle of each of its n by n equal parts
+    (`nodes_per_side`)."""
     node_positions_half_sides = grid_reach_half_sides * (
         (2.0 * np.arange(nodes_per_side) + 1.0) / nodes_per_side - 1.0
     )
@@ -456,14 +460,15 @@ def make_sampling_grid(nodes_per_side: int, grid_reach_half_sides: float) -> Sam
 
 
 def _grid_coordinates(node_positions_half_sides: Array) -> Array:
-    """Return the homogeneous coordinates (u, v, 1) of all nodes, (3, n * n)."""
+    """Return the homogeneous coordinates (u, v, 1) of all nodes, row by row, (3, n * n), of a grid
+    with `node_positions_half_sides` (n,) along both axes."""
     u, v = np.meshgrid(node_positions_half_sides, node_positions_half_sides)
     return np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
 
 
 def project_nodes(H_pinhole_marker: Array, node_uv1: Array) -> Array:
-    """Map homogeneous marker coordinates (3, n) with `H_pinhole_marker` to pixels, x and y (2, n),
-    of a pinhole camera."""
+    """Map homogeneous marker coordinates (3, n), in half sides from the marker's centre, with
+    `H_pinhole_marker` (3, 3) to pixels, x and y (2, n), of a pinhole camera."""
     q = H_pinhole_marker.dot(node_uv1)
     return np.asarray(q[:2] / q[2])
 
@@ -481,8 +486,9 @@ def lens_distortion_shift_px(
     grid: SamplingGrid, H_pinhole_marker: Array, camera: CameraModel
 ) -> Array:
     """Return the shift of each node due to lens distortion, distorted minus pinhole position, px
-    (2, n * n). `H_pinhole_marker` (3, 3) projects the marker to a pinhole camera. The shift is
-    computed at a few Chebyshev nodes and interpolated."""
+    (2, n * n). `H_pinhole_marker` (3, 3) projects the marker's coordinates, in half sides from its
+    centre, to pixels of a pinhole camera. The shift is computed at a few Chebyshev nodes and
+    interpolated."""
     node_uv1, between = _make_chebyshev_nodes(grid)
     pin = project_nodes(H_pinhole_marker, node_uv1)
     shift = (distort_px(pin, camera) - pin).reshape(
@@ -493,9 +499,9 @@ def lens_distortion_shift_px(
 
 @lru_cache(maxsize=64)
 def _make_chebyshev_nodes(grid: SamplingGrid) -> tuple[Array, Array]:
-    """Return Chebyshev nodes over the grid (3, _CHEBYSHEV_NODES_PER_AXIS^2), and the weights (n,
-    _CHEBYSHEV_NODES_PER_AXIS) with which values at these nodes are interpolated at the grid's own
-    nodes."""
+    """Return the homogeneous coordinates (3, _CHEBYSHEV_NODES_PER_AXIS^2) of Chebyshev nodes over
+    the grid, in half sides from the marker's centre, and the weights (n, _CHEBYSHEV_NODES_PER_AXIS)
+    with which values at these nodes are interpolated at the grid's own nodes."""
     reach = float(grid.node_positions_half_sides[-1])
     x = chebyshev.chebpts2(_CHEBYSHEV_NODES_PER_AXIS)
     degree = _CHEBYSHEV_NODES_PER_AXIS - 1
@@ -512,9 +518,9 @@ def _extract_patch(
     node_distortion_shift_px: Array,
 ) -> tuple[NDArray[np.float32], Array] | None:
     """Return the part of the image that contains all nodes, with room for their motion during the
-    fit, and the position (2, 1) of the top-left pixel of this part. The nodes are projected by
-    `H_pinhole_marker` (3, 3) and shifted by `node_distortion_shift_px` (2, n * n). None if a node
-    is outside the image."""
+    fit, and the position (2, 1) of the top-left pixel of this part. The nodes are projected to a
+    pinhole camera by `H_pinhole_marker` (3, 3) and shifted by the lens distortion
+    `node_distortion_shift_px` (2, n * n). None if a node is outside the image."""
     h, w = image.shape
     x, y = project_nodes(H_pinhole_marker, grid.node_uv1) + node_distortion_shift_px
     least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -584,7 +590,8 @@ class RenderedDrawing:
     def blurred_whiteness_and_off_paper_fraction(self) -> tuple[tuple[Array, Array], ...]:
         """The arrays of `render_whiteness_and_off_paper_fraction` after the blur. Each array is
         returned as a pair: its values (n * n,) at the nodes, and their derivatives (9, n * n) with
-        respect to the increment of the homography (8) and the variance of the blur."""
+        respect to the increment of the homography (8) and the variance of the blur, in squared node
+        spacings."""
         sharp_nodes = render_whiteness_and_off_paper_fraction(
             self.drawing, self.grid.nodes_per_side
         )
@@ -636,9 +643,9 @@ class RenderedDrawing:
 def render_blurred(
     drawing: MarkerDrawing, nodes_per_side: int, blur_table_index: int
 ) -> RenderedDrawing:
-    """Return the drawing at n by n nodes over the square that is compared with the image. The
-    standard deviation of its blur is ``exp(_LOG_BLUR_TABLE_STEP * blur_table_index)`` nodes. Only
-    blurs from this table are rendered, so that the results can be cached."""
+    """Return the drawing at n by n nodes (`nodes_per_side`) over the square that is compared with
+    the image. Its blur has the standard deviation ``exp(_LOG_BLUR_TABLE_STEP * blur_table_index)``,
+    in node spacings. Only blurs from this table are rendered, so that the results can be cached."""
     return RenderedDrawing(
         drawing,
         make_sampling_grid(nodes_per_side, drawing.photometric_fit_reach_half_sides),

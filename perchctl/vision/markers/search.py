@@ -56,9 +56,9 @@ ImageWindow = tuple[slice, slice]
 
 @dataclass(frozen=True, eq=False)
 class FoundMarkers:
-    """Result of a search: the raw corners (4, 2) px of at most one large and one small marker,
-    whether a marker was decoded as its mirror image (the camera image is mirrored), and the number
-    of complete targets in view."""
+    """Result of a search: the raw corners, (4, 2) px in the distorted image, of at most one large
+    and one small marker, whether a marker was decoded as its mirror image (the camera image is
+    mirrored), and the number of complete targets in view."""
 
     corners_px: dict[MarkerName, Array] = field(default_factory=dict)
     is_mirrored_marker_seen: bool = False
@@ -118,9 +118,10 @@ def search_half_size_image(
     expected_corners_px: Mapping[MarkerName, Array],
     measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None = None,
 ) -> FoundMarkers | None:
-    """Search the window in an image of half the size, which takes 1 ms. Return None if this search
-    misses a marker that is expected to be completely in view, or if the expected markers are not
-    suitable for it."""
+    """Search the window around the expected markers in an image of half the size, which takes 1 ms.
+    The corners returned are in pixels of the full-size image; the arguments are those of `search`.
+    Return None if this search misses a marker that is expected to be completely in view, or if the
+    expected markers are not suitable for it."""
     shape = detector_input.image.shape
     in_view = [quad for quad in expected_corners_px.values() if is_inside_image(quad, shape)]
     if (
@@ -149,10 +150,11 @@ def make_search_window(
     small_to_large_side_ratio: float,
     shape: tuple[int, ...],
 ) -> ImageWindow | None:
-    """Return the part of the image to search for the expected markers. If it is nearly the whole
-    image, return None; the caller then searches the whole image. `small_to_large_side_ratio` is the
-    side of the small marker divided by the side of the large one. The window contains the complete
-    large marker if it may be completely in the image."""
+    """Return the part of an image with the given `shape` (h, w) to search for the expected markers.
+    If it is nearly the whole image or too narrow, return None; the caller then searches the whole
+    image. `small_to_large_side_ratio` is the side of the small marker divided by the side of the
+    large one. The window contains the complete large marker if it may be completely in the
+    image."""
     h, w = shape[:2]
     if "large" in expected_corners_px:
         corners = expected_corners_px["large"]
@@ -226,6 +228,8 @@ def choose_markers(
     A small marker with the right size and rotation in the centre of a large one confirms both
     markers. Markers at expected positions take precedence over a pair elsewhere. Among single
     markers, the one with the shortest `measure_marker_to_own_target_distance_m` is chosen.
+    `small_to_large_side_ratio` is the side of the small marker divided by the side of the large
+    one.
     """
     if measure_marker_to_own_target_distance_m is not None and not expected_corners_px:
         candidates = _sort_by_own_target_distance(
@@ -291,7 +295,8 @@ def _pair_markers(
     """Return the pairs of a large and a small marker that form a target, best first, at most one
     for each large marker. Each pair consists of the nesting error
     (`nesting_error_to_tolerance_ratio`), the index of the large marker, and the index of the small
-    marker."""
+    marker in `candidates`. `small_to_large_side_ratio` is the side of the small marker divided by
+    the side of the large one."""
     large, small = candidates["large"], candidates["small"]
     pairs = [
         (nesting_error_to_tolerance_ratio(a, b, small_to_large_side_ratio), i, j)
