@@ -118,8 +118,8 @@ class SentCommand:
 
 @dataclass(frozen=True)
 class ExternalPositionStatus:
-    """The external positions sent to the vehicle so far: number, rate in Hz, the newest one with
-    its age in seconds, and why none is sent now."""
+    """The external positions sent to the vehicle: their number so far, their rate in the last
+    second, Hz, the newest one with the time since its exposure, s, and why none is sent now."""
 
     newest_position_age_s: float  # age of the newest position
     problem: str | None  # why none is sent now

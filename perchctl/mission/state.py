@@ -32,8 +32,8 @@ class BatteryOutlook:
 @dataclass(frozen=True)
 class LevelDescentState:
     """State of a descent by raw thrust: the last commanded thrust, 0..65535 (0 before the descent),
-    the climb rate, positive up, that recent commands cause but no sample shows yet, and when the
-    floor was detected (None before)."""
+    the change of the climb rate, positive up, that recent commands cause but no sample shows yet,
+    and when the floor was detected (None before)."""
 
     last_commanded_raw_thrust: float = 0.0
     climb_rate_measured_at_s: float = -math.inf  # time of the newest sample at the last tick

@@ -78,7 +78,8 @@ def estimate_marker_poses(
     `attitude` is the vehicle's attitude at the time of the frame (None if unknown). `start_pose` is
     the last pose of the target in the camera frame, corrected for the vehicle's motion since then
     (None if unknown). `previous_target_normal_cam` (3,) is the unit normal of the target (out of
-    the paper) in its last pose, in the axes of the camera at that time (None if unknown).
+    the paper) in its last pose, in the axes of the camera at that time (None if unknown); it is
+    only used without an attitude.
     """
     seen, t_s = correct_rolling_shutter(detections, setup), detections.t_s
     joint = None

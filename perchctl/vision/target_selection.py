@@ -45,7 +45,7 @@ the position of the vehicle's own target, or infinity if the marker is too far a
 
 _ASSUMED_DISTANCE_WITHOUT_POSE_M = 1e9
 """Distance, m, that is assumed for corners that yield no pose yet, for example next to a highlight.
-Such a marker is considered last, but not rejected."""
+Such a marker is considered last, but not rejected unless `own_target.max_distance_m` applies."""
 
 
 def marker_to_own_target_distance_m(
@@ -59,9 +59,9 @@ def marker_to_own_target_distance_m(
     """Return the horizontal distance, m, of a marker with corners (4, 2) px in the distorted image
     from the position of the vehicle's own target, or from the gear if this position or the attitude
     is unknown. `t_s` and `attitude` are those of the frame. The marker's position follows from a
-    pose estimated from its corners; if they yield no pose, the result is
+    pose estimated from its corners; if they yield no pose, the distance is assumed to be
     `_ASSUMED_DISTANCE_WITHOUT_POSE_M`. If `attitude` is known, distances above
-    `own_target.max_distance_m` become infinite."""
+    `own_target.max_distance_m`, including the assumed one, become infinite."""
     seen = Detection(marker, corners_px, _RAW_CORNER_SIGMA_PX, are_corners_fitted=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
     distance_m = (

@@ -99,9 +99,10 @@ MAX_HEIGHT_INTEGRATION_STEP_S = 0.5
 
 @dataclass(frozen=True)
 class DeadReckoning:
-    """Velocity of the vehicle (world axes) and position of its gear relative to the target (world x
-    and y, and distance below it), integrated from the accelerometer since the last good position or
-    sighting. The position's standard deviation is infinite while it is unknown."""
+    """Velocity of the vehicle (world axes), horizontal vector from its gear to the target (world x
+    and y), and distance of the gear below the target, integrated from the accelerometer since the
+    last good position or sighting. While they are unknown, the vector's standard deviation and the
+    distance are infinite."""
 
     imu: ImuMotion | None = None  # IMU motion up to which this value is integrated
     velocity_mps: Vector = ZERO_VECTOR
@@ -270,9 +271,9 @@ def _integrate_sample(
     is_estimated_velocity_being_corrected: bool,
     ignores_lateral_estimate: bool,
 ) -> DeadReckoning:
-    """Return the dead reckoning at `sample`, one sample after `previous_imu`, by the equations in
-    the module docstring. `imu` includes `sample`; `advance_dead_reckoning` explains the three
-    flags."""
+    """Return the dead reckoning at `sample`, the newest sample of `imu`, advanced from
+    `previous_imu`, one tick earlier, by the equations in the module docstring. It is unchanged
+    without a new sample. `advance_dead_reckoning` explains the three flags."""
     estimated_velocity_mps, dt_s = sample.velocity_mps, imu.t_s - previous_imu.t_s
     if not dt_s > 0.0:
         return old
@@ -374,7 +375,8 @@ def learn_estimated_velocity_bias(
     old: DeadReckoning, last: Telemetry, new: Telemetry
 ) -> DeadReckoning:
     """Return the dead reckoning with the lateral bias of the estimated velocity (world x and y)
-    learned from two successive samples, during a flight in free air under position control.
+    learned from `last` and `new`, the newest samples of two successive ticks, during a flight in
+    free air under position control.
 
     In a steady wind, the firmware mistakes the drag for a tilt, and the estimated velocity is wrong
     by up to 0.4 m/s while the vehicle hovers in place. The bias is the estimated velocity minus the

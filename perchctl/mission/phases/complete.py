@@ -31,8 +31,9 @@ thrust, s."""
 
 
 def enter_complete(state: PlannerState, previous_context: Context) -> PlannerState:
-    """Record the contact: the magnet holds the vehicle where `previous_context`, from the tick
-    before the transition, places it, at the offset of the last touch."""
+    """Record the contact: the magnet holds the vehicle where `previous_context`, the context before
+    the transition in the same tick, places it. The offset is that of the last touch or, if it is
+    not valid, the present one."""
     belief = replace(
         state.belief,
         vehicle_world_z_at_last_contact_m=previous_context.telemetry.position_m[2],

@@ -66,9 +66,9 @@ def time_since_hover_began_s(c: Context) -> float:
 
 
 def enter_hover(state: PlannerState, previous_context: Context) -> PlannerState:
-    """Restart the hover timer and the position errors. Both continue if `previous_context`, from
-    the tick before the transition, shows that the vehicle has only climbed back to its hover
-    position, within `MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S`."""
+    """Restart the hover timer and the position errors. Both continue if `previous_context`, the
+    context before the transition in the same tick, shows that the vehicle has only climbed back to
+    its hover position, within `MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S`."""
     if (
         is_returning_to_hover_height(previous_context.state)
         and previous_context.time_in_phase_s <= MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S

@@ -21,9 +21,9 @@ vehicle, s."""
 
 def enter_landing(state: PlannerState, previous_context: Context) -> PlannerState:
     """Start the descent. If the row that started the landing asserts that external positions or the
-    mounting are wrong, the descent does not use them. If `previous_context`, from the tick before
-    the transition, was in RECOVER, the offset of the last touch is forgotten unless the row asserts
-    that the vehicle is hanging there."""
+    mounting are wrong, the descent does not use them. If the phase in `previous_context`, the
+    context before the transition in the same tick, is RECOVER, the offset of the last touch is
+    forgotten unless the row asserts that the vehicle is hanging there."""
     diagnosis, b = state.entry.diagnosis, state.belief
     # The mounting may be right and the axes of the motion capture wrong. Position control would
     # then accelerate the landing until the vehicle tips over.

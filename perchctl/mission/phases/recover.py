@@ -56,7 +56,8 @@ STEADY_AFTER_ATTEMPT = Condition[Context](
 def enter_recover(state: PlannerState, previous_context: Context) -> PlannerState:
     """Record the last touch and the height of a contact or obstacle, and prepare a catch if the
     vehicle has slipped off its contact with too little thrust to carry most of its weight. The
-    measurements are those of `previous_context`, from the tick before the transition."""
+    measurements are those of `previous_context`, the context before the transition in the same
+    tick."""
     old, b, diagnosis = previous_context.state, previous_context.belief, state.entry.diagnosis
     z_m, thrust = b.telemetry.position_m[2], b.telemetry.thrust
     touched = old.phase is Phase.PERCH or VehicleDiagnosis.BLOCKED_BY_OBSTACLE in diagnosis

@@ -29,8 +29,8 @@ unconfirmed, m. Larger: a rotated camera leads the vehicle further away."""
 
 
 def enter_search(state: PlannerState, previous_context: Context) -> PlannerState:
-    """Start the search at the last setpoint in `previous_context`, the context of the tick before
-    the transition; without a setpoint, at the vehicle's position on entry."""
+    """Start the search at the last setpoint in `previous_context`, the context before the
+    transition in the same tick; without a setpoint, at the vehicle's position on entry."""
     setpoint = previous_context.state.setpoint
     if setpoint is None:
         return state

@@ -149,7 +149,8 @@ def fit_partly_visible_marker(
 
 def is_fully_visible(detector_input: DetectorInput, corners: RefinedCorners) -> bool:
     """True if no part of the marker is hidden and all its corners are inside the image, at least
-    `IMAGE_BORDER_MARGIN_PX` plus the standard deviation of the blur away from its border."""
+    `IMAGE_BORDER_MARGIN_PX` plus the standard deviation of the blurriest side's blur away from its
+    border."""
     margin_px = IMAGE_BORDER_MARGIN_PX + corners.blurriest_side_blur_sigma_px
     return is_inside_image(
         corners.corners_px, detector_input.image.shape, margin_px
