@@ -136,7 +136,7 @@ def test_views_that_fit_no_camera_are_refused() -> None:
     for i in range(0, 12, 2):
         noise = rng.normal(0, 4, views[i].corners_px.shape)
         views[i] = dataclasses.replace(views[i], corners_px=views[i].corners_px + noise)
-    with pytest.raises(InvalidValue, match="do not fit one camera"):
+    with pytest.raises(InvalidValue, match="do not fit a single camera model"):
         calibrate_camera(views, "plumb_bob")
 
 
