@@ -156,7 +156,7 @@ long = pytest.mark.long
                  ["LANDING", "LANDED"], marks=long, id="battery nearly empty"),
     # It would just do here: the gate does not bet on it, and lands with the figures.
     pytest.param(LOW, {"battery_rest_v": 3.775, **DATA_SHEET}, Outcome.SAFETY, 52,
-                 " s left; an attempt takes", ["ALIGN", "LANDING", "LANDED"], marks=long,
+                 " s left before a landing must begin", ["ALIGN", "LANDING", "LANDED"], marks=long,
                  id="battery for no attempt"),
 ])  # fmt: skip
 def test_what_goes_wrong_is_landed_and_named(

@@ -198,7 +198,7 @@ IN_TIME: list[tuple[dict[str, Any], str]] = [
 ]
 IN_TIME_LIKEWISE: list[tuple[dict[str, Any], str]] = [
     ({"velocity_variance_m2ps2": math.nan}, r"settle.*check the positioning system"),
-    ({"height_variance_m2": 1.0}, r"settle.*height's variance is 1\.00 m\^2, at most 0\.01"),
+    ({"height_variance_m2": 1.0}, r"settle.*height's variance is 1\.00 m\^2, but at most 0\.01"),
     ({"velocity_variance_m2ps2": 0.5, "position_m": HANGS}, "settle"),  # it is no height
     (
         {"velocity_variance_m2ps2": None},
