@@ -38,5 +38,4 @@ from .vision import PoseConfig as PoseConfig
 from .vision import TargetConfig as TargetConfig
 from .vision import WeightsConfig as WeightsConfig
 from .vision import aruco_dictionary as aruco_dictionary
-from .vision import check_marker_id as check_marker_id
 from .vision import dictionary_size as dictionary_size
