@@ -33,7 +33,7 @@ EXPECTED_LANDING_DURATION_BEYOND_DESCENT_S = 3.0
 MAX_VOLTAGE_DIP_BELOW_LIMIT_IN_PRESS_V = 0.3
 """Largest voltage dip below `safety.min_load_v`, V, during a press that is shorter than the
 debounce time."""
-COUNTED_ON_HOVER_TIME_FRACTION = 0.7
+TRUSTED_HOVER_TIME_FRACTION = 0.7
 """Fraction of a predicted hover time on which an attempt may rely: for worn cells near the end of
 their charge, the prediction is up to a third too long (tests/mission/test_energy.py). Larger: a
 battery that runs low may end an attempt in its ascent, or its landing may end in a fall."""
@@ -58,7 +58,8 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
     if c.belief.target.world_position_m is None:
         return BatteryOutlook(hover_time_left_s, None, consumed_charge_mah, energy.rest_v)
     predicted = predict_durations(c)
-    spare_s = _time_until_landing_must_begin_s(c) - predicted.remaining_attempt_duration_s
+    time_left_s = _time_until_landing_must_begin_s(c, hover_times, predicted.landing_duration_s)
+    spare_s = time_left_s - predicted.remaining_attempt_duration_s
     left = c.planner.attempts - c.state.failed_attempts
     attempts = 0  # also for values that are NaN
     if spare_s >= 0.0:
@@ -80,13 +81,13 @@ def _is_battery_reading_missing(c: Context) -> bool:
     return without_reading_s > MAX_TIME_WITHOUT_BATTERY_READING_S
 
 
-def _time_until_landing_must_begin_s(c: Context) -> float:
-    """Return the time left for attempts, s: the part of the predicted hover time that can be
-    counted on (`HoverTimes`). Without a prediction or a recent battery reading, the time is at most
-    that until row `battery-unknown` lands the vehicle, minus the landing and the reserve."""
-    landing_duration_s = predict_durations(c).landing_duration_s
+def _time_until_landing_must_begin_s(
+    c: Context, hover_times: HoverTimes | None, landing_duration_s: float
+) -> float:
+    """Return the time left for attempts, s: the trusted part of the predicted hover time
+    (`HoverTimes`). Without a prediction or a recent battery reading, the time is at most that until
+    row `battery-unknown` lands the vehicle, minus the landing and the reserve."""
     reserve_s = c.safety.energy_reserve_s
-    hover_times = _predict_hover_times_now(c)
     by_charge_s = math.inf
     if hover_times is not None:
         by_charge_s = hover_times.until_landing_must_begin_s(landing_duration_s, reserve_s)
@@ -105,15 +106,13 @@ class HoverTimes:
     until_min_load_v_s: float  # until the voltage in hover falls below `safety.min_load_v`
 
     def until_landing_must_begin_s(self, landing_duration_s: float, reserve_s: float) -> float:
-        """Return the time for attempts that can be counted on, s: until row `battery-low` lands the
+        """Return the time for attempts that can be trusted, s: until row `battery-low` lands the
         vehicle, or until only a landing and the reserve are left. Low power does not stop the
         motors, so a landing that has begun goes on until the voltage in hover reaches
         `safety.min_load_v`."""
         return min(
-            COUNTED_ON_HOVER_TIME_FRACTION * self.until_battery_low_s,
-            COUNTED_ON_HOVER_TIME_FRACTION * self.until_min_load_v_s
-            - landing_duration_s
-            - reserve_s,
+            TRUSTED_HOVER_TIME_FRACTION * self.until_battery_low_s,
+            TRUSTED_HOVER_TIME_FRACTION * self.until_min_load_v_s - landing_duration_s - reserve_s,
         )
 
 
@@ -224,7 +223,9 @@ def battery_shortfall_text(c: Context) -> str:
     predicted = predict_durations(c)
     has = "the remaining battery time is unknown"
     if c.state.battery.hover_time_left_s is not None:
-        has = f"the battery has {max(0.0, _time_until_landing_must_begin_s(c)):.0f} s left"
+        hover_times, landing_s = _predict_hover_times_now(c), predicted.landing_duration_s
+        time_left_s = _time_until_landing_must_begin_s(c, hover_times, landing_s)
+        has = f"the battery has {max(0.0, time_left_s):.0f} s left"
     return (
         f"{has} before a landing must begin; an attempt takes "
         f"{predicted.remaining_attempt_duration_s:.0f} s (landing "

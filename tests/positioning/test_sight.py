@@ -12,7 +12,14 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import Place
 from perchctl.positioning import TargetFeed
-from perchctl.positioning.sight import GROUND_FRAMES, OLDEST_S, body_place, target_place
+from perchctl.positioning.sight import (
+    GROUND_FRAMES,
+    OLDEST_S,
+    SETTLED_POSITION_M,
+    SETTLED_TILT_RAD,
+    body_place,
+    target_place,
+)
 from perchctl.vehicle import ExternalPosition
 from perchctl.vision import MarkerPose, VehicleState
 from tests.helpers.mission import target_at
@@ -153,7 +160,10 @@ def test_a_place_is_learned_only_after_the_estimate_has_settled(
         )
         shown(it, true, t_s, believed)
     assert it.target is not None
-    assert math.dist(it.target.position_m, TARGET.position_m) < 0.025
+    # what the frames may differ by, seen at the target's distance
+    away_m = float(np.linalg.norm(TARGET.position_m))
+    most_m = SETTLED_POSITION_M + SETTLED_TILT_RAD * away_m
+    assert math.dist(it.target.position_m, TARGET.position_m) < most_m
 
 
 # --- in the air --------------------------------------------------------------------------
