@@ -296,6 +296,21 @@ def test_a_flight_with_a_camera_that_mirrors_perches() -> None:
     assert_perched(fly_short({"camera.mirrored": True}))
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("profile", "seed"),
+    [
+        ("sim", 20951311),  # much resistance: the pack looked empty without its resting voltage
+        ("sim", 20951321),  # its landing was to end before the firmware reports low power
+        ("target_only", 20961144),  # the target was learned while the attitude still settled
+    ],
+)
+def test_a_flight_that_was_refused_or_landed_without_need_perches(
+    profile: str, seed: int, tmp_path: Path
+) -> None:
+    assert fly_seed(load_profile(profile), seed, tmp_path / "flight.jsonl").outcome == "perched"
+
+
 # --- Two vehicles in one room -------------------------------------------------------------------
 
 APART_M = 0.8
