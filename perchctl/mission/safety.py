@@ -14,6 +14,7 @@ from perchctl.mission.belief.contact import (
     HANGING,
     HANGING_CONFIRMATION_DWELL_S,
     MIN_SATURATED_TO_FULL_THRUST_RATIO,
+    SLOW_AT_FULL_THRUST,
     THRUST_SATURATED_WITHOUT_CLIMB,
     Support,
     contact_height_tolerance_m,
@@ -90,6 +91,10 @@ TARGET_BELOW_VEHICLE_DWELL_S = 0.3
 """Time for which the target must appear below the vehicle, s."""
 THRUST_SATURATED_WITHOUT_CLIMB_DWELL_S = 2.0
 """Time at full thrust after which no thrust remains for a press, s."""
+SLOW_TAKEOFF_DWELL_S = 1.0
+"""Time at full thrust after which a vehicle that takes off too slowly cannot fly, s; the weakest
+vehicles that can perch reach full thrust for up to 0.4 s. Larger: the vehicle sinks to the floor
+from a greater height. Smaller: a weak vehicle that can perch lands."""
 HELD_BY_OTHER_OBJECT_DWELL_S = 2.0
 """Time that it takes to distinguish the magnet from other supports, s."""
 MAX_VELOCITY_VARIANCE_WITHOUT_SIGHTING_M2PS2 = 0.02
@@ -318,6 +323,12 @@ def is_climb_blocked_off_target(c: Context) -> bool:
     )
 
 
+def is_thrust_insufficient_for_takeoff(c: Context) -> bool:
+    """True if the vehicle has taken off too slowly at full thrust for `SLOW_TAKEOFF_DWELL_S`: only
+    the ground effect or a battery that is still rested lifts it, and it would soon sink back."""
+    return c.true_for_s(SLOW_AT_FULL_THRUST) >= SLOW_TAKEOFF_DWELL_S
+
+
 def is_thrust_insufficient_for_press(c: Context) -> bool:
     """True if no thrust remains for a press, measured or predicted. Measured: the vehicle has not
     climbed for `THRUST_SATURATED_WITHOUT_CLIMB_DWELL_S` at full thrust. Predicted, at the stand-off
@@ -538,7 +549,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "cannot-rise",
         {Phase.APPROACH},
-        lambda c: is_climb_blocked(c) or is_thrust_insufficient_for_press(c),
+        lambda c: is_climb_blocked(c) or is_thrust_insufficient_for_takeoff(c),
         lambda c: (
             f"cannot climb above {c.belief.height_m:.2f} m: an obstacle is above, or the thrust is "
             f"too low"

@@ -132,6 +132,39 @@ def test_a_weak_vehicle_at_full_thrust_is_not_called_pressed(
     assert row != "too-weak" or "battery too low" in state.reason
 
 
+def flown_at_full_thrust(
+    state: PlannerState, for_s: float, z_m: float, climb_mps: float
+) -> PlannerState:
+    """For so long at full thrust with that climb rate from that height on, or until a row acts."""
+    for t_s in times(for_s):
+        now_m = z_m + climb_mps * (t_s - BEGIN_S)
+        target = target_at(t_s, (0.2, 0.0, CEILING_M), (0.0, 0.0, now_m))
+        sample = at(
+            now_m,
+            obs={"target": target},
+            thrust=float(FULL_THRUST),
+            velocity_mps=(0.0, 0.0, climb_mps),
+        )
+        state, _ = planner.step_mission(state, sample(t_s), PROFILE)
+        if state.transition_name:
+            return state
+    return state
+
+
+@given(climb_mps=st.floats(-0.1, 0.6))
+def test_only_a_vehicle_that_climbs_at_full_thrust_goes_on_taking_off(climb_mps: float) -> None:
+    """One that the ground effect lifts, or a rested battery, would soon sink and hit the floor."""
+    state = flown_at_full_thrust(state_in(Phase.APPROACH), 1.1, 0.15, climb_mps)
+    assert (state.transition_name == "cannot-rise") is (climb_mps < 0.2)
+
+
+@given(climb_mps=st.floats(-0.45, 0.04))
+def test_a_vehicle_that_sinks_at_full_thrust_lands(climb_mps: float) -> None:
+    """Sinking is no fall that full thrust would end: seed 21011139 went on along the floor."""
+    state = flown_at_full_thrust(state_in(Phase.ALIGN), 2.3, 1.3, climb_mps)
+    assert (state.transition_name, state.phase) == ("too-weak", Phase.LANDING)
+
+
 @pytest.mark.parametrize(
     ("commanded_raw_thrust", "reads", "known"),
     [

@@ -64,6 +64,10 @@ far larger."""
 MAX_MOTIONLESS_CLIMB_RATE_MPS = 0.05
 """Vertical speed below which the vehicle counts as motionless, m/s. Larger: a slow descent looks
 like hanging."""
+MIN_CLIMB_RATE_AT_FULL_THRUST_MPS = 0.2
+"""Climb rate that any vehicle with enough thrust to hover exceeds at full thrust, m/s: at full
+thrust, the weakest vehicles that can perch take off at 0.3 to 0.5 m/s. Larger: such a vehicle lands
+at once. Smaller: a vehicle that only the ground effect lifts rises further before it sinks."""
 MAX_HOVER_SPEED_MPS = 0.3
 """Largest speed at which the thrust is hover thrust, m/s."""
 MAX_HOVER_CLIMB_RATE_MPS = 0.27
@@ -108,9 +112,6 @@ MIN_GEAR_TO_TARGET_Z_WHEN_ON_FLOOR_M = 0.3
 MAX_CLIMB_RATE_IF_FALLING_IN_WEIGHT_TRANSFER_MPS = -0.05
 """Climb rate below which a vehicle with a low specific force is falling, once the weight transfer
 by raw thrust has begun, m/s."""
-MIN_CLIMB_RATE_IF_TOO_WEAK_TO_CLIMB_MPS = -0.15
-"""Climb rate, m/s, that distinguishes two reasons why a vehicle at full thrust does not climb:
-above this value, it is too weak to climb; below it, the vehicle is falling."""
 
 # --- time ---
 MIN_TIME_AFTER_STOP_TO_TRUST_ZERO_THRUST_S = 5.0
@@ -501,10 +502,12 @@ def _does_imu_show_support(b: Belief) -> bool:
 
 def _is_thrust_saturated(b: Belief) -> bool:
     full = b.telemetry.thrust >= MIN_SATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
-    return (
-        full
-        and MIN_CLIMB_RATE_IF_TOO_WEAK_TO_CLIMB_MPS < b.climb_mps < MAX_MOTIONLESS_CLIMB_RATE_MPS
-    )
+    return full and b.climb_mps < MAX_MOTIONLESS_CLIMB_RATE_MPS
+
+
+def _is_slow_at_full_thrust(b: Belief) -> bool:
+    full = b.telemetry.thrust >= MIN_SATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
+    return full and b.climb_mps < MIN_CLIMB_RATE_AT_FULL_THRUST_MPS
 
 
 TARGET_CONTACT = Condition(
@@ -555,6 +558,13 @@ THRUST_SATURATED_WITHOUT_CLIMB = Condition(
     required_data=RequiredData.TELEMETRY,
 )
 """The thrust is at its limit, and the vehicle is not climbing."""
+SLOW_AT_FULL_THRUST = Condition(
+    "slow at full thrust",
+    _is_slow_at_full_thrust,
+    persists_across_phases=True,
+    required_data=RequiredData.TELEMETRY,
+)
+"""The thrust is at its limit, and the vehicle climbs more slowly than one that can hover."""
 SUPPORT_CONDITIONS = (
     TARGET_CONTACT,
     MAGNET_HOLDS_VEHICLE,
@@ -567,6 +577,7 @@ SUPPORT_CONDITIONS = (
     CLIMB_BLOCKED,
     IMU_SHOWS_SUPPORT,
     THRUST_SATURATED_WITHOUT_CLIMB,
+    SLOW_AT_FULL_THRUST,
 )
 """All conditions defined in this module."""
 
