@@ -311,6 +311,13 @@ def test_a_flight_that_was_refused_or_landed_without_need_perches(
     assert fly_seed(load_profile(profile), seed, tmp_path / "flight.jsonl").outcome == "perched"
 
 
+@pytest.mark.long
+def test_a_vehicle_that_cannot_hover_lands_without_a_fall(tmp_path: Path) -> None:
+    """44 g on weak motors: it sank to the floor at full thrust and went on along it."""
+    flown = fly_seed(load_profile("extreme"), 21011139, tmp_path / "flight.jsonl")
+    assert (flown.outcome, flown.fell) == ("landed", False)
+
+
 # --- Two vehicles in one room -------------------------------------------------------------------
 
 APART_M = 0.8
