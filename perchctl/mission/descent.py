@@ -93,6 +93,12 @@ still climbs or sinks."""
 ON_FLOOR_DWELL_S = 0.5
 """Time for which a vehicle must be motionless before its motors are stopped, s."""
 
+# --- level, by raw thrust ---
+MIN_TIME_BETWEEN_HEADING_SETPOINTS_S = 0.5
+"""Shortest time between two setpoints that give the firmware a new heading during a descent by raw
+thrust, s. Larger: after a second jump, the vehicle turns for longer. Smaller: with a heading that
+jumps again and again, position control moves the vehicle in a wrong direction."""
+
 # --- by the firmware's own landing ---
 LANDING_COMMAND_PERIOD_S = 0.3
 """Time between landing commands, s. Without its notify message, the firmware does not execute a
@@ -407,7 +413,22 @@ def _descend_by_setpoints(c: Context) -> Action:
 
 def _descend_by_raw_thrust(c: Context) -> Action:
     """Descend level by raw thrust. While neither climb rate nor hover thrust is known well enough,
-    descend by setpoints."""
+    descend by setpoints.
+
+    In a tick in which the estimated heading jumps, one setpoint with the new heading is sent
+    instead. Under raw thrust, the firmware keeps the heading setpoint that it received last, so it
+    would turn the vehicle by the jump. Such a turn saturates the motors and costs up to a tenth of
+    the lift.
+    """
+    descent = c.state.descent
+    if (
+        c.obs.heading_jump_rad > math.radians(c.safety.heading_lost_deg)
+        and c.belief.is_telemetry_fresh
+        and c.t_s - descent.heading_setpoint_sent_at_s >= MIN_TIME_BETWEEN_HEADING_SETPOINTS_S
+    ):
+        here = make_setpoint_at_vehicle(c)
+        descent = replace(descent, heading_setpoint_sent_at_s=c.t_s)
+        return replace(c.state, descent=descent, setpoint=here), limit_setpoint(c, here)
     return (
         _descend_by_setpoints(c)
         if should_wait_for_climb_rate(c)

@@ -33,13 +33,15 @@ class BatteryOutlook:
 class LevelDescentState:
     """State of a descent by raw thrust: the last commanded thrust, 0..65535 (0 before the descent),
     the change of the climb rate, positive up, that recent commands cause but no sample shows yet,
-    and when the floor was detected (None before)."""
+    when the floor was detected (None before), and when a setpoint last gave the firmware a new
+    heading."""
 
     last_commanded_raw_thrust: float = 0.0
     climb_rate_measured_at_s: float = -math.inf  # time of the newest sample at the last tick
     # climb rate that recent commands cause and no sample shows yet
     climb_rate_change_not_yet_measured_mps: float = 0.0
     floor_detected_at_s: float | None = None  # time at which the floor was detected
+    heading_setpoint_sent_at_s: float = -math.inf
 
 
 @dataclass(frozen=True)

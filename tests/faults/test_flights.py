@@ -115,6 +115,20 @@ def test_nothing_goes_wrong(name: str, phase: Phase, by: str) -> None:
     assert not_known or keeps_promise(result), result
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [
+        ("target_only", 21201418),  # the firmware turned by the jump, on motors at their limit
+    ],
+)
+def test_nothing_goes_wrong_any_more_in_a_seed_of_a_campaign(name: str, seed: int) -> None:
+    flown_profile = load_profile(name)
+    scenario = draw_scenario(flown_profile, seed)
+    result = fly_with_fault(flown_profile, draw_case(seed, scenario), scenario)
+    assert result.counted == (), result
+
+
 @pytest.mark.parametrize(
     ("name", "changes", "kept"),
     [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -216,7 +217,12 @@ def sent(profile: Profile, state: dict[str, Any], **observed: Any) -> type[Comma
         ({"link_problem": "gone"}, Land, RawThrust),
         ({"behind_s": 0.5}, Land, RawThrust),
         ({"age_s": 0.6}, Land, RawThrust),
-        ({"has_estimated_position_jumped": True, "heading_jump_rad": 1.5}, RawThrust, RawThrust),
+        # One setpoint with the new heading, so that the firmware does not turn by the jump.
+        (
+            {"has_estimated_position_jumped": True, "heading_jump_rad": 1.5},
+            PositionSetpoint,
+            PositionSetpoint,
+        ),
         (
             {"has_estimated_position_jumped": True, "heading_jump_rad": 1.5, "behind_s": 0.5},
             RawThrust,
@@ -243,6 +249,27 @@ def test_each_part_of_what_is_known_has_its_own_age(
     doubted sooner than what decks measure."""
     assert sent(DECKS, {}, **observed) is with_decks
     assert sent(BY_TARGET, {}, **observed) is is_target_positioned
+
+
+@given(jumps=st.lists(st.booleans(), min_size=1, max_size=120))
+def test_a_jump_of_the_heading_is_set_anew_at_most_twice_a_second(jumps: list[bool]) -> None:
+    """Under raw thrust the firmware turns back to the heading that it was told last: it is told the
+    new one in place. A heading that keeps jumping hands the vehicle to no position control."""
+    state = remembering(state_in(Phase.LANDING, NOW_S - 1.0), t_s=NOW_S - TICK_S)
+    told_s: list[float] = []
+    for tick, jumped in enumerate([True, *jumps]):
+        t_s, yaw_rad = NOW_S + tick * TICK_S, 0.7 + tick
+        jump = {"has_estimated_position_jumped": True, "heading_jump_rad": 1.5} if jumped else {}
+        state, command = descent.step_landing(state, at(obs=jump, yaw_rad=yaw_rad)(t_s), DECKS)
+        if isinstance(command, PositionSetpoint):
+            assert jumped
+            assert (command.x_m, command.y_m, command.yaw_rad) == (0.0, 0.0, yaw_rad)
+            assert command.z_m <= 1.0
+            told_s.append(t_s)
+        else:
+            assert isinstance(command, RawThrust)
+    assert told_s[0] == NOW_S
+    assert all(b - a >= 0.5 - 1e-9 for a, b in pairwise(told_s))
 
 
 def uncorrected(for_s: float) -> dict[str, Any]:

@@ -171,7 +171,7 @@ CASES: dict[str, Case] = {
     "telemetry-stale": Case(P.ALIGN, P.LANDING, old(seen(), BEGIN_S), 1.5, O.SAFETY),
     "heading-lost": Case(
         P.ALIGN, P.LANDING, seen(has_estimated_position_jumped=True, heading_jump_rad=1.5), 0.1,
-        O.SAFETY, RawThrust
+        O.SAFETY, PositionSetpoint
     ),
     "position-astray": Case(
         P.APPROACH, P.LANDING, aside(0.2, 0.01), 0.1, O.SAFETY, RawThrust, z_m=0.3, profile=MOCAP
