@@ -80,6 +80,7 @@ class FaultyFlight:
             has been updated. In a fleet, the flights wait for each other in this function.
         others: (name, position m) of each other rigid body that the motion-capture system tracks;
             None: as drawn from the seed.
+        climb_withheld: as in `FlightParts`.
     """
 
     def __init__(
@@ -91,6 +92,7 @@ class FaultyFlight:
         *,
         on_sample: Callable[[float], None] = lambda t_s: None,
         others: tuple[tuple[str, tuple[float, float, float]], ...] | None = None,
+        climb_withheld: Callable[[], str | None] = lambda: None,
     ) -> None:
         profile = e.apply_to_profile(profile, case.effects)
         self._profile, self._case, self._log = profile, case, log
@@ -101,6 +103,7 @@ class FaultyFlight:
         if capture is not None and others is not None:
             capture = replace(capture, others=others)
         self._on_sample = on_sample
+        self._newest_tick: Tick | None = None
         self._end: str | None = None
         self._vehicle = vehicle = WatchedVehicle(scenario, camera, profile.target, capture)
         self._radio = radio = FaultyRadio(Radio(scenario.radio_bursts()))
@@ -133,6 +136,7 @@ class FaultyFlight:
             positions=lockstep_feed(self._link, profile),
             remarks=tuple if log is None else log.remarks,
             judges=(self,),
+            climb_withheld=climb_withheld,
             simulated=True,
         )
         safety, radius_m = profile.safety, profile.planner.perch.contact_xy_m
@@ -176,6 +180,11 @@ class FaultyFlight:
         while it runs."""
         return self._end
 
+    @property
+    def newest_tick(self) -> Tick | None:
+        """The newest tick of the loop; None before the mission."""
+        return self._newest_tick
+
     def land(self) -> None:
         """Command a landing, as the operator would."""
         self._switch.land()
@@ -186,6 +195,7 @@ class FaultyFlight:
             self._injector.begin(self._vehicle.t_s)
 
     def tick(self, tick: Tick) -> None:
+        self._newest_tick = tick
         for injector in self._injectors:
             injector.tick(tick)
 

@@ -11,7 +11,9 @@ a `ThreadCoroutine` that pauses at each tick of the room's clock:
 
 Meanwhile, the vehicles of later groups wait on the floor at their homes. A vehicle whose flight has
 ended stays where it is, whether it is hanging, standing or lying. A vehicle of the next group takes
-off only if none of these vehicles is in its way.
+off only if none of these vehicles is in its way. As in a real flight, a vehicle begins to climb
+only while `find_climb_obstacle` finds no other vehicle near its climb; the statuses that this
+decision needs arrive without delay.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -39,11 +41,14 @@ from perchctl.faults import (
     draw_case,
 )
 from perchctl.fleet.coroutine import ThreadCoroutine
+from perchctl.fleet.dispatch import VehicleView, find_climb_obstacle
 from perchctl.fleet.fleet import vehicle_seed
+from perchctl.fleet.messages import Result, VehicleOutcome
 from perchctl.fleet.plan import FleetPlan
 from perchctl.fleet.results import FleetResult, fleet_outcome, refused_vehicle
 from perchctl.fleet.room import PlacedVehicle, Room, body_name, place_fleet
 from perchctl.fleet.schedule import OBSTACLE_M, gap_text
+from perchctl.fleet.vehicle_process import flight_status
 
 TICK_S = 0.02
 """Period of the room's clock, s; a vehicle that flies at 0.4 m/s moves 8 mm in this time. Larger: a
@@ -162,8 +167,16 @@ def _whom(
 class _Seat:
     """One vehicle's flight in the room: a thread that waits at each tick."""
 
-    def __init__(self, placed: PlacedVehicle, case: Case, room: Room, clock: _Clock) -> None:
+    def __init__(
+        self,
+        placed: PlacedVehicle,
+        case: Case,
+        room: Room,
+        clock: _Clock,
+        climb_withheld: Callable[[str], str | None],
+    ) -> None:
         self._placed, self._case, self._room, self._clock = placed, case, room, clock
+        self._climb_withheld = climb_withheld
         self._begin_s = clock.t_s
         self.name = placed.name
         self.flight: FaultyFlight | None = None
@@ -179,6 +192,7 @@ class _Seat:
                 placed.scenario,
                 on_sample=self._wait,
                 others=self._room.others_of(self.name) or None,
+                climb_withheld=partial(self._climb_withheld, self.name),
             )
         except ConnectionFailed as error:  # if motion capture does not see the vehicle, for example
             return refused_vehicle(str(error))
@@ -190,12 +204,37 @@ class _Seat:
         while self._begin_s + t_s >= self._clock.t_s - 1e-6:
             self.coroutine.pause()
 
+    def view(self) -> VehicleView:
+        """Return what the parent would know about this vehicle now. A program that has ended sends
+        nothing more."""
+        flight = self.flight
+        if flight is None or flight.newest_tick is None:
+            return VehicleView(name=self.name)  # on the floor
+        turned_s = self._clock.t_s - self._begin_s - flight.newest_tick.t_s
+        status, ended = flight_status(flight.newest_tick), flight.end is not None
+        return VehicleView(
+            name=self.name,
+            status=replace(status, loop_age_s=0.0 if ended else turned_s),
+            silent_s=turned_s if ended else 0.0,
+            result=None if flight.end is None else _flown_result(flight.end),
+        )
+
     def note_place(self) -> None:
         """Record the vehicle's estimated position, in its own axes, which is all that the parent
         knows."""
         if self.flight is not None:
             read = self.flight.vehicle.firmware.log_value
             self.known_m = read("stateEstimate.x"), read("stateEstimate.y")
+
+
+def _flown_result(end: str) -> Result:
+    """Return the part of a flight's result that `find_climb_obstacle` uses."""
+    outcome = {
+        "perched": VehicleOutcome.PERCHED,
+        "landed": VehicleOutcome.LANDED,
+        "aborted": VehicleOutcome.ABORTED,
+    }.get(end, VehicleOutcome.FAILED)
+    return Result(exit_code=0, outcome=outcome, reason="", has_flown=True)
 
 
 class _Clock:
@@ -220,6 +259,7 @@ class FleetFlight:
         self._placed = {each.name: each for each in placed}
         self._room, self._clock = Room(placed), _Clock()
         self._results: dict[str, FaultResult] = {}
+        self._flying: list[_Seat] = []  # flights of the current group, also those that have ended
         # known positions, in room axes, of the vehicles whose flights have ended
         self._known_m: dict[str, Point] = {}
         self._landed_all = ""  # the vehicle whose failure makes all the others land
@@ -250,6 +290,7 @@ class FleetFlight:
         begin_s, cause_s = self._clock.t_s, self._trouble.at_s
         waiting = cause_s is not None and number == self._trouble.group
         with self._seats(names) as seats:
+            self._flying = list(seats)
             while seats:
                 self._clock.advance()
                 for seat in list(seats):
@@ -268,9 +309,15 @@ class FleetFlight:
             seats = []
             for name in names:
                 case = self._trouble.cases.get(name, HEALTHY)
-                seats.append(_Seat(self._placed[name], case, self._room, self._clock))
+                seats.append(
+                    _Seat(self._placed[name], case, self._room, self._clock, self._climb_withheld)
+                )
                 stack.callback(seats[-1].coroutine.close)
             yield seats
+
+    def _climb_withheld(self, name: str) -> str | None:
+        """Return why the vehicle must not begin its climb now, as the parent would decide."""
+        return find_climb_obstacle(self._plan, name, [seat.view() for seat in self._flying])
 
     def _begin_cause(self, seats: Sequence[_Seat]) -> None:
         self._cause_has_begun = True

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
+from itertools import groupby
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -31,6 +32,7 @@ from perchctl.fleet import (
     plan_sha256,
     select_fleet_faults,
 )
+from perchctl.fleet.dispatch import HUNG_S
 from perchctl.fleet.fleet import Fleet, FleetVehicle
 from perchctl.fleet.lockstep import (
     TICK_S,
@@ -39,6 +41,8 @@ from perchctl.fleet.lockstep import (
     draw_trouble,
     swapped_cases,
 )
+from perchctl.fleet.messages import Stage as Flying
+from perchctl.fleet.messages import Status
 from perchctl.fleet.results import refused_vehicle
 from perchctl.fleet.room import Room, body_name, place_fleet
 from perchctl.record import from_exact_json, to_exact_json
@@ -53,12 +57,13 @@ SAMPLE_S = 0.01
 
 @dataclass
 class Script:
-    """What a made-up flight does: it ends after `lasts_s`, and its estimate has it at `lies_m`,
-    in its own axes."""
+    """What a made-up flight does: it ends after `lasts_s`, its estimate has it at `lies_m`, in its
+    own axes, and it tells the parent that it flies at `flies_m`."""
 
     lasts_s: float = 0.1
     outcome: str = "perched"
     lies_m: tuple[float, float] = (0.0, 0.0)
+    flies_m: tuple[float, float] | None = None
 
 
 @dataclass
@@ -68,16 +73,24 @@ class Stage:
     scripts: dict[str, Script] = field(default_factory=dict)
     log: list[str] = field(default_factory=list)
     others: dict[str, Any] = field(default_factory=dict)
+    withheld: dict[str, list[str | None]] = field(default_factory=dict)  # by vehicle, each tick
 
 
 class FakeFlight:
     """A `FaultyFlight` by script."""
 
     def __init__(
-        self, stage: Stage, name: str, case: Case, on_sample: Callable[[float], None]
+        self,
+        stage: Stage,
+        name: str,
+        case: Case,
+        on_sample: Callable[[float], None],
+        climb_withheld: Callable[[], str | None],
     ) -> None:
         self._stage, self.name, self._case, self._on_sample = stage, name, case, on_sample
+        self._climb_withheld = climb_withheld
         self._script = stage.scripts.get(name, Script())
+        self.newest_tick: Any = None
         self.vehicle = flying(0.0, 0.0, 1.0)
         place = dict(zip(("stateEstimate.x", "stateEstimate.y"), self._script.lies_m, strict=True))
         self.vehicle.firmware.log_value = place.__getitem__
@@ -88,6 +101,8 @@ class FakeFlight:
         self._stage.log.append(f"{self.name} starts")
         for step in range(1, round(self._script.lasts_s / SAMPLE_S) + 1):
             self.sample(step * SAMPLE_S)
+            self.newest_tick = SimpleNamespace(t_s=step * SAMPLE_S, flies_m=self._script.flies_m)
+            self._stage.withheld.setdefault(self.name, []).append(self._climb_withheld())
             if self._lands:
                 break
         self.end = "landed" if self._lands else self._script.outcome
@@ -110,11 +125,15 @@ class FakeFlight:
 def stage(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stage]:
     made = Stage()
 
-    def flight(profile: Any, case: Case, _scenario: Any, *, on_sample: Any, others: Any) -> Any:
+    def flight(profile: Any, case: Case, _scenario: Any, *, others: Any, **hooks: Any) -> Any:
         made.others[profile.name] = others
-        return FakeFlight(made, profile.name, case, on_sample)
+        return FakeFlight(made, profile.name, case, **hooks)
+
+    def status(tick: Any) -> Status:
+        return Status(stage=Flying.FLYING, telemetry_age_s=0.0, place_m=tick.flies_m)
 
     monkeypatch.setattr(lockstep, "FaultyFlight", flight)
+    monkeypatch.setattr(lockstep, "flight_status", status)
     return made
 
 
@@ -223,6 +242,21 @@ def test_who_measures_in_the_room_s_axes_is_known_to_lie_where_it_does(stage: St
     assert f"{away_m:.2f}" != "0.60"
     result = fly(planned, are_exact=False)
     assert f"v0 is on the floor {away_m:.2f} m from its home" in result.vehicles[1].reason
+
+
+def test_who_is_near_a_climb_or_may_be_keeps_it_waiting(stage: Stage) -> None:
+    """As the parent of a real fleet decides: v0 strays below v1's target, is out of sight once its
+    program has been killed, and is no obstacle once it must be down."""
+    near_m = (1.5, 0.0)
+    stage.scripts = {"v0": Script(0.2, "gone", flies_m=near_m), "v1": Script(11.0, flies_m=near_m)}
+    fly(row(2, 1.5, order="together"))
+    close = "v0 is too close to this vehicle's climb path"
+    unknown = "the distance of v0 from this vehicle's climb path is unknown"
+    told = [why for why, _ in groupby(stage.withheld["v1"])]
+    assert told == [close, unknown, None]
+    lost_s = SAMPLE_S * stage.withheld["v1"].count(unknown)
+    assert lost_s == pytest.approx(HUNG_S, abs=2 * TICK_S)
+    assert set(stage.withheld["v0"]) == {None}
 
 
 def test_land_all_lands_who_flies_and_starts_nobody_else(stage: Stage) -> None:
