@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission import Observation, OperatorRequest, Outcome, Phase, PlannerState, planner
@@ -151,6 +151,7 @@ def flown_at_full_thrust(
     return state
 
 
+@settings(max_examples=20)  # each is a flight of 60 ticks
 @given(climb_mps=st.floats(-0.1, 0.6))
 def test_only_a_vehicle_that_climbs_at_full_thrust_goes_on_taking_off(climb_mps: float) -> None:
     """One that the ground effect lifts, or a rested battery, would soon sink and hit the floor."""
@@ -158,6 +159,7 @@ def test_only_a_vehicle_that_climbs_at_full_thrust_goes_on_taking_off(climb_mps:
     assert (state.transition_name == "cannot-rise") is (climb_mps < 0.2)
 
 
+@settings(max_examples=20)  # each is a flight of 120 ticks
 @given(climb_mps=st.floats(-0.45, 0.04))
 def test_a_vehicle_that_sinks_at_full_thrust_lands(climb_mps: float) -> None:
     """Sinking is no fall that full thrust would end: seed 21011139 went on along the floor."""
