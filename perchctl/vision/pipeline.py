@@ -119,12 +119,11 @@ def make_pipeline(
         camera=camera,
         readout_s=profile.camera.readout_s,
     )
-    mask = None
-    if profile.camera.mask is not None:
-        mask = (
-            read_mask(profile.camera.mask, camera.size_px) if hidden_mask is None else hidden_mask
-        )
-        mask = mask[:, ::-1] if profile.camera.mirrored else mask
+    mask = hidden_mask
+    if mask is None and profile.camera.mask is not None:
+        mask = read_mask(profile.camera.mask, camera.size_px)
+    if mask is not None and profile.camera.mirrored:
+        mask = mask[:, ::-1]
     detector_setup = make_detector_setup(profile.detector, profile.target, mask)
     if detector_setup.is_line_fit_enabled:
         warm_up_truncated_marker_fit(detector_setup.patterns, camera)

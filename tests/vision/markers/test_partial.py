@@ -309,6 +309,19 @@ def test_a_mask_stands_beside_its_profile(tmp_path: Path) -> None:
     assert make_pipeline(Profile(), CAMERA).detector_setup.static_hidden_mask is None
 
 
+@pytest.mark.parametrize("image", [None, np.full((H, W), 255, np.uint8)])
+def test_a_mask_that_is_given_replaces_that_of_the_profile(
+    image: Grey | None, tmp_path: Path
+) -> None:
+    """Also where the profile names none, or a file that could not be used."""
+    given = np.zeros((H, W), np.bool_)
+    given[:40, :70] = True
+    named = Profile() if image is None else profile_with(tmp_path, image)
+    assert np.array_equal(
+        make_pipeline(named, CAMERA, given).detector_setup.static_hidden_mask, given
+    )
+
+
 WHITE, BLACK = np.full((H, W), 255, np.uint8), np.zeros((H, W), np.uint8)
 
 
