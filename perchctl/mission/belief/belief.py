@@ -32,8 +32,8 @@ ESTIMATE_SETTLING_TIME_AFTER_POSITION_GAP_S = 0.5
 estimate is trusted before it has converged."""
 MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S = 0.13
 """Largest age of the newest external position, in addition to the camera's latency, at which it
-still corrects the estimated velocity, s: three pictures at 30 per second. Larger:
-`is_estimate_missing_gust` detects an impact later."""
+still corrects the estimated velocity, s: four picture intervals at 30 per second, so three lost
+pictures make no difference. Larger: `is_estimate_missing_gust` detects an impact later."""
 MIN_SPEED_GAINED_IN_GUST_MPS = 0.2
 """Lateral speed, gained without a sighting, above which the cause must be an impact or gust, m/s;
 flights without a fault show 0.06 m/s. Larger: an impact goes unnoticed. Smaller: an attitude error
