@@ -16,7 +16,18 @@ from perchctl.analysis.plot import draw_thrust
 from perchctl.errors import InvalidValue
 from perchctl.files import atomic_write, write_error
 from perchctl.geometry import Array
-from perchctl.plot import BLACK, BLUE, GREY, GRID, ORANGE, PURPLE, SKY, VERMILLION, new_figure
+from perchctl.plot import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    GRID,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    new_figure,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -307,7 +318,7 @@ def _write_gif(pictures: Iterator[Rgb], path: Path, period: Fraction) -> None:
     from PIL import Image
 
     greys = np.repeat(np.linspace(0.0, 255.0, 64)[:, None], 3, axis=1)
-    lines = 255.0 * np.array([to_rgb(c) for c in (SKY, BLUE, ORANGE, PURPLE, VERMILLION)])
+    lines = 255.0 * np.array([to_rgb(c) for c in (SKY, BLUE, ORANGE, PURPLE, VERMILLION, GREEN)])
     tints = [255.0 - share * (255.0 - lines) for share in (1.0, 0.75, 0.5, 0.25)]
     palette = Image.new("P", (1, 1))
     palette.putpalette(np.rint(np.vstack([greys, *tints])).astype(np.uint8).tobytes())

@@ -9,8 +9,11 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from PIL import Image
 
 from perchctl.analysis import write_fleet_film
+from perchctl.analysis.film import film_period, write_pictures
+from perchctl.analysis.fleet_film import COLOURS
 from perchctl.fleet import read_fleet_folder
 from perchctl.record import read_log
 from tests.helpers import log as synthetic
@@ -91,3 +94,12 @@ def test_a_folder_that_cannot_be_filmed_is_refused_in_a_sentence(folder: Path) -
     path.write_text(json.dumps({"vehicles": [end("west", log=None)]}), encoding="utf-8")
     refused = run("log", "film", str(folder))
     assert (refused.code, "has left a log" in refused.complaint) == (20, True)
+
+
+def test_a_gif_keeps_the_colour_of_each_vehicle(tmp_path: Path) -> None:
+    """The third one's was that of the first."""
+    shown = np.array([[[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in COLOURS]], np.uint8)
+    write_pictures(iter([shown.repeat(8, 0).repeat(8, 1)]), tmp_path / "film.gif", film_period(6.0))
+    with Image.open(tmp_path / "film.gif") as image:
+        kept = np.asarray(image.convert("RGB"))[4, 4::8]
+    np.testing.assert_allclose(kept, shown[0], atol=4)  # the palette is that of these colours
