@@ -196,6 +196,15 @@ def film(flown: Flight, file: Path) -> None:
     )
 
 
+def fleet_film(_: Flight, file: Path) -> None:
+    """The shipped fleet of four simulated vehicles, in real time, as a film."""
+    with tempfile.TemporaryDirectory() as folder:
+        _perchctl("fleet", "fly", "--yes", "--record", "--log-dir", folder)
+        (flown,) = Path(folder).iterdir()
+        rate = ("--rate", "4", *FILM[2:])
+        _perchctl("log", "film", str(flown), "-o", str(file.resolve()), "--force", *rate)
+
+
 def terminal(flown: Flight, file: Path) -> None:
     """The panel in a terminal, with the lines above it."""
     index = _shown(flown)
@@ -492,6 +501,7 @@ PICTURES: dict[str, Callable[[Flight, Path], None]] = {
     "target.png": target,
     "flight.png": flight,
     "film.gif": film,
+    "fleet.gif": fleet_film,
     "panel.svg": terminal,
     "page.png": page,
     "report.png": report,
