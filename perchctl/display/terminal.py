@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import textwrap
 import threading
 from collections import deque
 from typing import TextIO
@@ -79,13 +80,27 @@ class TerminalDisplay:
         while self._lines:
             line = self._lines.popleft()
             if self._live is not None:
-                self._live.console.print(Text(line), soft_wrap=True)
+                folded = _fold(line, self._live.console.width)
+                self._live.console.print(Text(folded), soft_wrap=True)
             else:
                 self._stream.write(line + "\n")
                 self._stream.flush()
         panel = None if self._live is None else self._new_panel()
         if self._live is not None and panel is not None:
             self._live.update(panel, refresh=True)
+
+
+def _fold(line: str, columns: int) -> str:
+    """Break a line between words, and indent what follows to the text after its time. A word that
+    is longer than a line, such as a path, stays whole, so that it can be copied."""
+    indent = line.find("] ") + 2 if line.startswith("[") else 0
+    return textwrap.fill(
+        line,
+        columns,
+        subsequent_indent=" " * indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 def new_live(stream: TextIO) -> Live:

@@ -52,6 +52,18 @@ def test_one_line_an_event_where_there_is_no_terminal() -> None:
     ]
 
 
+def test_a_long_event_breaks_between_words_and_below_its_text(terminal: Terminal) -> None:
+    path = "/home/somebody/" + "a_long_folder/" * 7 + "flight.jsonl"
+    reporter = FlightPanel(terminal)
+    reporter.event(
+        note(100.0, f"the battery has 8 s left before a landing must begin; {path} of it")
+    )
+    reporter.close()
+    lines = ESCAPE.sub("", terminal.getvalue()).splitlines()
+    assert lines[0] == "[   0.00 s] the battery has 8 s left before a landing must begin;"
+    assert lines[1:3] == [" " * 12 + path, " " * 12 + "of it"]
+
+
 @pytest.mark.parametrize("last", ["PERCHED", "LANDED", "ABORTED"])
 def test_a_new_phase_is_shown_without_waiting_and_the_last_one_stays(
     last: str, terminal: Terminal
