@@ -418,17 +418,20 @@ def _descend_by_raw_thrust(c: Context) -> Action:
     In a tick in which the estimated heading jumps, one setpoint with the new heading is sent
     instead. Under raw thrust, the firmware keeps the heading setpoint that it received last, so it
     would turn the vehicle by the jump. Such a turn saturates the motors and costs up to a tenth of
-    the lift.
+    the lift. No setpoint is sent to a vehicle that is so low that the setpoint would be above it.
     """
-    descent = c.state.descent
+    descent, b = c.state.descent, c.belief
     if (
         c.obs.heading_jump_rad > math.radians(c.safety.heading_lost_deg)
-        and c.belief.is_telemetry_fresh
+        and b.is_telemetry_fresh
+        and descent.floor_detected_at_s is None
         and c.t_s - descent.heading_setpoint_sent_at_s >= MIN_TIME_BETWEEN_HEADING_SETPOINTS_S
+        and all(map(math.isfinite, (*b.telemetry.position_m, b.telemetry.yaw_rad)))
     ):
-        here = make_setpoint_at_vehicle(c)
-        descent = replace(descent, heading_setpoint_sent_at_s=c.t_s)
-        return replace(c.state, descent=descent, setpoint=here), limit_setpoint(c, here)
+        setpoint = limit_setpoint(c, make_setpoint_at_vehicle(c))
+        if setpoint.z_m <= b.telemetry.position_m[2]:
+            descent = replace(descent, heading_setpoint_sent_at_s=c.t_s)
+            return replace(c.state, descent=descent, setpoint=setpoint), setpoint
     return (
         _descend_by_setpoints(c)
         if should_wait_for_climb_rate(c)

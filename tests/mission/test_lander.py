@@ -272,6 +272,23 @@ def test_a_jump_of_the_heading_is_set_anew_at_most_twice_a_second(jumps: list[bo
     assert all(b - a >= 0.5 - 1e-9 for a, b in pairwise(told_s))
 
 
+@pytest.mark.parametrize(
+    ("z_m", "tel"),
+    [
+        (0.02, {}),  # a setpoint must be higher than that
+        (1.0, {"position_m": (math.nan, 0.0, 1.0)}),
+        (1.0, {"yaw_rad": math.nan}),
+    ],
+)
+def test_a_heading_is_not_set_anew_where_that_would_lift_the_vehicle_or_is_no_number(
+    z_m: float, tel: dict[str, Any]
+) -> None:
+    jump = {"has_estimated_position_jumped": True, "heading_jump_rad": 1.5}
+    began = remembering(state_in(Phase.LANDING, NOW_S - 1.0), t_s=NOW_S - TICK_S)
+    _, command = descent.step_landing(began, at(z_m, obs=jump, **tel)(NOW_S), DECKS)
+    assert isinstance(command, RawThrust)
+
+
 def uncorrected(for_s: float) -> dict[str, Any]:
     """A deck that has given no positions for so long."""
     return {"imu": ImuMotion(t_s=NOW_S, fusion_age=FusionAge(1e-3, NOW_S, NOW_S - for_s))}
