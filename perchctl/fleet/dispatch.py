@@ -223,15 +223,19 @@ def air_places(plan: FleetPlan, views: Sequence[VehicleView]) -> dict[str, Point
     position in these axes; None for a vehicle whose position is currently unknown."""
     places: dict[str, Point | None] = {}
     for view in views:
-        vehicle = plan.fleet.vehicle(view.name)
-        if view.is_in_air and vehicle.frame == "room":
-            place_m = None if view.status is None else view.status.place_m
-            is_known = place_m is not None and all(map(math.isfinite, place_m))
+        if view.is_in_air and plan.fleet.vehicle(view.name).frame == "room":
             is_fresh = view.place_age_s <= FRESH_PLACE_S
-            places[view.name] = (
-                vehicle.flown_to_room(place_m) if place_m and is_known and is_fresh else None
-            )
+            places[view.name] = last_place_m(plan, view) if is_fresh else None
     return places
+
+
+def last_place_m(plan: FleetPlan, view: VehicleView) -> Point | None:
+    """Return the newest position that this vehicle has reported in the room's axes, however old it
+    is; None if its newest status contains none."""
+    vehicle = plan.fleet.vehicle(view.name)
+    place_m = None if view.status is None else view.status.place_m
+    is_known = vehicle.frame == "room" and place_m is not None and all(map(math.isfinite, place_m))
+    return vehicle.flown_to_room(place_m) if place_m is not None and is_known else None
 
 
 def find_climb_obstacle(plan: FleetPlan, name: str, views: Sequence[VehicleView]) -> str | None:
@@ -240,8 +244,8 @@ def find_climb_obstacle(plan: FleetPlan, name: str, views: Sequence[VehicleView]
 
     A vehicle without a known position is assumed to be in its corridor only if it has no position
     in room axes to report, is still flying, answers, and is not landing. Otherwise the vehicle may
-    be up to `TARGET_ALONE_M` away from its path. The same applies to a vehicle whose flight has
-    ended without a known landing, until it is down.
+    be up to `TARGET_ALONE_M` away from its path, and from the position that it reported last. The
+    same applies to a vehicle whose flight has ended without a known landing, until it is down.
     """
     target_m, radius_m = plan.fleet.vehicle(name).target_m, plan.corridors[name].radius_m
     least_m = radius_m + plan.separation_m - ROUNDING_M
@@ -259,7 +263,9 @@ def find_climb_obstacle(plan: FleetPlan, name: str, views: Sequence[VehicleView]
         if other in places or lands or view.is_silent or not view.is_in_air:
             corridor = plan.corridors[other]
             lost = replace(corridor, radius_m=max(corridor.radius_m, TARGET_ALONE_M))
-            if lost.distance_to_m(target_m) < least_m:
+            last_m = last_place_m(plan, view)
+            strayed = last_m is not None and math.dist(last_m, target_m) - TARGET_ALONE_M < least_m
+            if strayed or lost.distance_to_m(target_m) < least_m:
                 return f"the distance of {other} from this vehicle's climb path is unknown"
     return None
 

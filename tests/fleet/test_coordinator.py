@@ -272,7 +272,10 @@ def test_a_climb_is_permitted_again_and_again_until_a_neighbour_is_near() -> Non
     assert [child.order.may_climb for child in rig.children.values()] == [True, False, True, True]
     assert rig["v1"].order.why_not_climb == "v0 is too close to this vehicle's climb path"
     assert rig.words == [OperatorRequest.NONE] * 4, "it waits, but does not land"
-    rig.end("v0", ABORTED)
+    rig.end("v0", ABORTED)  # nobody knows whether it is down
+    unknown = "the distance of v0 from this vehicle's climb path is unknown"
+    assert rig["v1"].order.why_not_climb == unknown
+    rig.pass_s(HUNG_S + 0.1)
     assert rig["v1"].order.may_climb
 
 

@@ -17,6 +17,7 @@ from perchctl.errors import InvalidValue
 from perchctl.fleet import make_plan
 from perchctl.fleet.dispatch import (
     FRESH_PLACE_S,
+    FRESH_STATUS_S,
     HUNG_S,
     NEAR_MARGIN_M,
     VehicleView,
@@ -27,6 +28,7 @@ from perchctl.fleet.dispatch import (
 )
 from perchctl.fleet.messages import BEAT_S, Result, Stage, Status, VehicleOutcome
 from perchctl.fleet.radio import SLOWEST_PERIOD_S
+from perchctl.fleet.schedule import TARGET_ALONE_M
 from perchctl.mission import OperatorRequest, Phase
 from tests.fleet.rig import fleet, on_air
 
@@ -251,6 +253,19 @@ def test_an_older_position_permits_no_climb(places: tuple[Point, ...], more_s: f
     older = [replace(view, silent_s=view.silent_s + more_s) for view in views]
     before = permitted(views)
     assert all(before[name] for name, may in permitted(older).items() if may)
+
+
+WIDE = make_plan(fleet([((4.0 * n, 0.0), (4.0 * n, 0.0)) for n in range(2)], order="together"))
+
+
+@given(away_m=st.floats(0.0, 4.0), angle_rad=angles)
+def test_who_was_last_seen_near_a_climb_may_still_be_there(away_m: float, angle_rad: float) -> None:
+    """However far from its own way: this vehicle had left it before it fell silent."""
+    x_m, y_m = 4.0 + away_m * math.cos(angle_rad), away_m * math.sin(angle_rad)
+    last = flying("v0", WIDE.fleet.vehicle("v0").as_flown.to_estimate((x_m, y_m)))
+    why = find_climb_obstacle(WIDE, "v1", [replace(last, silent_s=FRESH_STATUS_S)])
+    near_m = WIDE.corridors["v1"].radius_m + WIDE.separation_m + TARGET_ALONE_M
+    assert (why is not None) is (away_m < near_m) or abs(away_m - near_m) < 1e-5
 
 
 @pytest.mark.parametrize(
