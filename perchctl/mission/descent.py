@@ -113,6 +113,23 @@ ONBOARD_LANDING_DURATION_MARGIN_S = 1.8
 """Time added to the duration of the quintic landing trajectory, s."""
 QUINTIC_PEAK_TO_MEAN_SPEED_RATIO = 1.875
 """Ratio of a quintic's peak speed to its mean speed."""
+ONBOARD_LANDING_EXTENSION_LEAD_S = 1.0
+"""Time before the end of its trajectory at which the firmware's landing is extended, s; the vehicle
+has sunk by 95 % of the trajectory by then. Larger: the vehicle sinks more slowly, because each
+trajectory starts from rest. Smaller: if commands are lost, the trajectory ends first."""
+MAX_ONBOARD_LANDING_EXTENSIONS = 4
+"""Number of extensions, each of which lowers the vehicle by 0.3 to 0.5 m. Larger: if the estimate
+sinks faster than the vehicle can, the vehicle climbs for longer. Smaller: after a longer drift, the
+last trajectory ends in the air."""
+MIN_DEPTH_BELOW_GROUND_TO_EXTEND_LANDING_M = 0.1
+"""Estimated depth below the ground at which a vehicle that still flies shows that the ground is
+lower, m. Larger: a trajectory ends before it is extended. Smaller: the error of a height without
+drift extends the landing."""
+MIN_THRUST_TO_HOVER_RATIO_IF_FLYING = 0.85
+"""Thrust that shows during the firmware's landing that the vehicle still flies, as a fraction of
+the hover thrust. On the floor, above the end of its trajectory, the firmware commands its smallest
+thrust. Larger: a vehicle that sinks faster and faster counts as landed. Smaller: a vehicle that has
+just touched down counts as flying."""
 MAX_HEIGHT_DRIFT_IN_LANDING_GOAL_M = 1.0
 """Largest assumed drift of the height, m."""
 MAX_SPECIFIC_FORCE_IN_FALL_G = 0.5
@@ -466,7 +483,9 @@ def make_onboard_landing_command(
 
 def _command_onboard_landing(c: Context) -> Action:
     """Send the command for the firmware's own landing until the telemetry shows that the vehicle is
-    executing it."""
+    executing it, and again if the estimate shows the vehicle below the ground while it still flies:
+    then the estimated height has drifted, or the ground is lower here, and the trajectory would end
+    in the air, where the firmware would stop the motors."""
     tel, b = c.telemetry, c.belief
     state, away = end_press(c)
     if (
@@ -498,6 +517,22 @@ def _command_onboard_landing(c: Context) -> Action:
         and b.is_imu_fresh
         and tel.has_bit(HL_ACTIVE)
     )
+    flies_below_ground = (
+        b.height_m < -MIN_DEPTH_BELOW_GROUND_TO_EXTEND_LANDING_M
+        and tel.thrust >= MIN_THRUST_TO_HOVER_RATIO_IF_FLYING * b.hover_thrust
+    )
+    extension_count = state.descent.onboard_landing_extension_count
+    if (
+        seen
+        and flies_below_ground
+        and c.t_s >= state.descent.onboard_landing_ends_at_s - ONBOARD_LANDING_EXTENSION_LEAD_S
+        and extension_count < MAX_ONBOARD_LANDING_EXTENSIONS
+    ):
+        # The firmware refuses to land while it is landing; a setpoint ends its trajectory.
+        descent = replace(state.descent, onboard_landing_extension_count=extension_count + 1)
+        return replace(
+            state, descent=descent, stop_or_land_command_count=0
+        ), make_setpoint_at_vehicle(c)
     if (
         not seen
         and waited > LANDING_COMMAND_PERIOD_S
@@ -507,8 +542,12 @@ def _command_onboard_landing(c: Context) -> Action:
         order = make_onboard_landing_command(
             c.planner, b.ground_z_m, time_in_flight_s, tel.position_m[2]
         )
+        descent = state.descent
+        if not state.stop_or_land_command_count:  # the firmware ignores the commands that follow
+            descent = replace(descent, onboard_landing_ends_at_s=c.t_s + order.duration_s)
         return replace(
             state,
+            descent=descent,
             last_stop_or_land_command_at_s=c.t_s,
             stop_or_land_command_count=state.stop_or_land_command_count + 1,
             setpoint=None,

@@ -30,11 +30,14 @@ class BatteryOutlook:
 
 
 @dataclass(frozen=True)
-class LevelDescentState:
-    """State of a descent by raw thrust: the last commanded thrust, 0..65535 (0 before the descent),
-    the change of the climb rate, positive up, that recent commands cause but no sample shows yet,
-    when the floor was detected (None before), and when a setpoint last gave the firmware a new
-    heading."""
+class DescentState:
+    """State of a descent.
+
+    By raw thrust: the last commanded thrust, 0..65535 (0 before the descent), the change of the
+    climb rate, positive up, that recent commands cause but no sample shows yet, when the floor was
+    detected (None before), and when a setpoint last gave the firmware a new heading. By the
+    firmware's own landing: when its trajectory ends, and how often it was extended.
+    """
 
     last_commanded_raw_thrust: float = 0.0
     climb_rate_measured_at_s: float = -math.inf  # time of the newest sample at the last tick
@@ -42,6 +45,8 @@ class LevelDescentState:
     climb_rate_change_not_yet_measured_mps: float = 0.0
     floor_detected_at_s: float | None = None  # time at which the floor was detected
     heading_setpoint_sent_at_s: float = -math.inf
+    onboard_landing_ends_at_s: float = math.inf
+    onboard_landing_extension_count: int = 0
 
 
 @dataclass(frozen=True)
@@ -139,7 +144,7 @@ class PlannerState:
     last_stop_or_land_command_at_s: float | None = None  #: last command to land or to stop motors
     stop_or_land_command_count: int = 0
     commanded_raw_thrust: int | None = None  #: last commanded raw thrust; None in position mode
-    descent: LevelDescentState = LevelDescentState()
+    descent: DescentState = DescentState()
     hold_reason: str = ""  #: why the vehicle is holding its position; empty without a hold
     waiting_reason: str = ""  #: why a row keeps the mission in its phase; empty if none does
     total_wait_in_phase_s: float = 0.0  #: total waiting time in this phase

@@ -119,6 +119,7 @@ def test_nothing_goes_wrong(name: str, phase: Phase, by: str) -> None:
 @pytest.mark.parametrize(
     ("name", "seed"),
     [
+        ("sim", 21211562),  # a drifting height: a landing of its own ended in the air
         ("target_only", 21201418),  # the firmware turned by the jump, on motors at their limit
     ],
 )

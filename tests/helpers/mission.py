@@ -15,7 +15,7 @@ from perchctl.mission.belief.thrust import HoverThrust
 from perchctl.mission.context import Context
 from perchctl.mission.observe import observe
 from perchctl.mission.phase import Severity
-from perchctl.mission.state import HoverErrors, LevelDescentState
+from perchctl.mission.state import DescentState, HoverErrors
 from perchctl.mission.table import PHASE_CONDITIONS, PHASES
 from perchctl.profile import Profile
 from perchctl.vehicle import ARMED, AUTO_ARM, CAN_FLY, FLYING, PositionSetpoint, Telemetry
@@ -172,7 +172,7 @@ def note(t_s: float, text: str) -> Event:
 LEARNED_SIGMA = 0.005
 """Spread, as a share, of a hover thrust that quiet flight has taught."""
 _BELIEF = {each.name for each in fields(Belief)} - {"t_s"}
-_DESCENT = {each.name for each in fields(LevelDescentState)}
+_DESCENT = {each.name for each in fields(DescentState)}
 _ENTRY = {
     "entered_s": "t_s",
     "entry_m": "position_m",

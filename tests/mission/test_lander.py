@@ -63,7 +63,7 @@ from tests.helpers.mission import (
     target_at,
     telemetry,
 )
-from tests.mission.rig import BEGIN_S, TICK_S, at, fly, is_setpoint
+from tests.mission.rig import BEGIN_S, TICK_S, at, fly, is_setpoint, times
 
 DECKS = PROFILES["deck"]
 NOW_S = 10.0
@@ -332,6 +332,52 @@ def test_a_mounting_that_seems_turned_may_be_the_capture_s_axes(
     )
     assert ("motion capture may have swapped axes" in state.reason) is astray
     assert isinstance(command, RawThrust if astray else PositionSetpoint)
+
+
+def landed_onboard(z_m: float, for_s: float, **tel: Any) -> list[tuple[float, Command]]:
+    """The commands, with their times, of a landing of the vehicle's own, which the estimate shows
+    at this height all along."""
+    state = remembering(state_in(Phase.LANDING, NOW_S - 1.0, z_m), t_s=NOW_S - TICK_S)
+    sent_: list[tuple[float, Command]] = []
+    for t_s in times(for_s):
+        bits = AIRBORNE | HL_ACTIVE if sent_ and isinstance(sent_[-1][1], Land) else AIRBORNE
+        state, command = descent.step_landing(state, at(z_m, supervisor=bits, **tel)(t_s), DECKS)
+        sent_ += [] if isinstance(command, Idle) else [(t_s, command)]
+    return sent_
+
+
+@given(z_m=st.floats(-2.0, -0.11), thrust=st.floats(0.86, 1.1).map(lambda r: r * HOVER_THRUST))
+@settings(max_examples=20)  # each is a landing of 500 ticks
+def test_a_landing_of_its_own_does_not_end_in_the_air(z_m: float, thrust: float) -> None:
+    """Below its floor and on hover thrust a vehicle still flies: seed 21211562 was cut at 0.4 m."""
+    given_ = landed_onboard(z_m, 10.0, thrust=thrust)
+    ends_s = math.inf
+    for (t_s, command), (_, before) in zip(given_, [given_[0], *given_], strict=False):
+        assert t_s < ends_s
+        if isinstance(command, Land):
+            assert command.height_m <= z_m - DECKS.planner.landing.undershoot_m
+            # The first of several: the firmware refuses to land while it is landing.
+            ends_s = ends_s if isinstance(before, Land) else t_s + command.duration_s
+        else:
+            assert command == PositionSetpoint(0.0, 0.0, z_m, 0.0)  # here: it climbs nowhere
+            ends_s = math.inf
+    assert ends_s > NOW_S + 10.0
+
+
+@pytest.mark.parametrize(
+    ("z_m", "thrust"), [(-0.3, 0.8 * HOVER_THRUST), (-0.05, HOVER_THRUST), (0.2, HOVER_THRUST)]
+)
+def test_a_landing_that_has_reached_the_floor_or_is_above_it_is_not_drawn_out(
+    z_m: float, thrust: float
+) -> None:
+    commands = [command for _, command in landed_onboard(z_m, 10.0, thrust=thrust)]
+    assert [type(command) for command in commands] == [Land] * 3
+
+
+def test_a_landing_is_drawn_out_a_few_times_only() -> None:
+    """A vehicle that never arrives is one that its estimate carries upwards."""
+    commands = landed_onboard(-0.3, 25.0, thrust=HOVER_THRUST)
+    assert sum(isinstance(command, PositionSetpoint) for _, command in commands) == 4
 
 
 @pytest.mark.parametrize(
