@@ -15,7 +15,6 @@ from perchctl.mission.belief.contact import (
     HANGING_CONFIRMATION_DWELL_S,
     MIN_SATURATED_TO_FULL_THRUST_RATIO,
     SLOW_AT_FULL_THRUST,
-    THRUST_SATURATED_WITHOUT_CLIMB,
     Support,
     contact_height_tolerance_m,
     gear_to_target_at_last_touch_or_now,
@@ -89,8 +88,13 @@ than this value, m/s, position control must be oscillating; in flights with prom
 difference is 0.1. Larger: the vehicle strikes the target. Smaller: a gust ends the flight."""
 TARGET_BELOW_VEHICLE_DWELL_S = 0.3
 """Time for which the target must appear below the vehicle, s."""
-THRUST_SATURATED_WITHOUT_CLIMB_DWELL_S = 2.0
-"""Time at full thrust after which no thrust remains for a press, s."""
+SLOW_HOVER_DWELL_S = 2.0
+"""Time at nearly full thrust after which a vehicle that hovers has too little thrust, s. Larger: it
+sinks to the floor from a greater height. Smaller: a gust makes a weak vehicle land."""
+SLOW_ASCENT_DWELL_S = 4.0
+"""Time at nearly full thrust after which a vehicle that should climb has too little thrust, s; a
+weak vehicle that can perch climbs the last part slowly. Larger: it sinks further before it lands.
+Smaller: it lands just below the target."""
 SLOW_TAKEOFF_DWELL_S = 1.0
 """Time at full thrust after which a vehicle that takes off too slowly cannot fly, s; the weakest
 vehicles that can perch reach full thrust for up to 0.4 s. Larger: the vehicle sinks to the floor
@@ -329,20 +333,22 @@ def is_thrust_insufficient_for_takeoff(c: Context) -> bool:
     return c.true_for_s(SLOW_AT_FULL_THRUST) >= SLOW_TAKEOFF_DWELL_S
 
 
-def is_thrust_insufficient_for_press(c: Context) -> bool:
-    """True if no thrust remains for a press, measured or predicted. Measured: the vehicle has not
-    climbed for `THRUST_SATURATED_WITHOUT_CLIMB_DWELL_S` at full thrust. Predicted, at the stand-off
-    before the press: hover thrust exceeds `MIN_SATURATED_TO_FULL_THRUST_RATIO` times the largest
-    press thrust.
+def is_thrust_insufficient(c: Context) -> bool:
+    """True if no thrust remains to fly on or to press, measured or predicted. Measured: the vehicle
+    has hardly climbed at nearly full thrust for `SLOW_HOVER_DWELL_S`, or for `SLOW_ASCENT_DWELL_S`
+    in an ascent. Predicted, at the stand-off before the press: hover thrust exceeds
+    `MIN_SATURATED_TO_FULL_THRUST_RATIO` times the largest press thrust.
 
     A mission that hovers does not press, so nothing is predicted for it. False while a press is
     being ended.
     """
     if c.state.must_end_press:
         return False
-    if c.true_for_s(THRUST_SATURATED_WITHOUT_CLIMB) >= THRUST_SATURATED_WITHOUT_CLIMB_DWELL_S:
+    ascends = c.state.phase is Phase.ASCEND
+    dwell_s = SLOW_ASCENT_DWELL_S if ascends else SLOW_HOVER_DWELL_S
+    if c.true_for_s(SLOW_AT_FULL_THRUST) >= dwell_s:
         return True
-    near = c.state.phase is Phase.ASCEND and c.true_for_s(NEAR_STANDOFF_HEIGHT) >= 0.0
+    near = ascends and c.true_for_s(NEAR_STANDOFF_HEIGHT) >= 0.0
     near = near and c.planner.hover is None
     return near and c.belief.hover_thrust > MIN_SATURATED_TO_FULL_THRUST_RATIO * max_press_thrust(
         c.profile
@@ -568,7 +574,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "too-weak",
         CAMERA_GUIDED_PHASES,
-        is_thrust_insufficient_for_press,
+        is_thrust_insufficient,
         "hovering needs all of the thrust: the vehicle is too heavy, the battery too low, or an "
         "obstacle is above",
     ),

@@ -312,9 +312,16 @@ def test_a_flight_that_was_refused_or_landed_without_need_perches(
 
 
 @pytest.mark.long
-def test_a_vehicle_that_cannot_hover_lands_without_a_fall(tmp_path: Path) -> None:
-    """44 g on weak motors: it sank to the floor at full thrust and went on along it."""
-    flown = fly_seed(load_profile("extreme"), 21011139, tmp_path / "flight.jsonl")
+@pytest.mark.parametrize(
+    "seed",
+    [
+        21011139,  # it sank to the floor at full thrust and went on along it
+        21231243,  # it hovered at 98 % of its thrust, and a gap in the radio let it touch the floor
+        21231300,  # the ground effect lifted it, and it sank back
+    ],
+)
+def test_a_vehicle_that_can_hardly_hover_lands_without_a_fall(seed: int, tmp_path: Path) -> None:
+    flown = fly_seed(load_profile("extreme"), seed, tmp_path / "flight.jsonl")
     assert (flown.outcome, flown.fell) == ("landed", False)
 
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission import Observation, OperatorRequest, Outcome, Phase, PlannerState, planner
-from perchctl.mission.belief.contact import MAGNET_HOLDS_VEHICLE, THRUST_SATURATED_WITHOUT_CLIMB
+from perchctl.mission.belief.contact import MAGNET_HOLDS_VEHICLE, SLOW_AT_FULL_THRUST
 from perchctl.mission.phase import PRE_LANDING_PHASES
 from perchctl.mission.setpoints import MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M, limit_setpoint
 from perchctl.profile import Profile
@@ -133,12 +133,12 @@ def test_a_weak_vehicle_at_full_thrust_is_not_called_pressed(
 
 
 def flown_at_full_thrust(
-    state: PlannerState, for_s: float, z_m: float, climb_mps: float
+    state: PlannerState, for_s: float, z_m: float, climb_mps: float, aside_m: float = 0.2
 ) -> PlannerState:
     """For so long at full thrust with that climb rate from that height on, or until a row acts."""
     for t_s in times(for_s):
         now_m = z_m + climb_mps * (t_s - BEGIN_S)
-        target = target_at(t_s, (0.2, 0.0, CEILING_M), (0.0, 0.0, now_m))
+        target = target_at(t_s, (aside_m, 0.0, CEILING_M), (0.0, 0.0, now_m))
         sample = at(
             now_m,
             obs={"target": target},
@@ -159,12 +159,31 @@ def test_only_a_vehicle_that_climbs_at_full_thrust_goes_on_taking_off(climb_mps:
     assert (state.transition_name == "cannot-rise") is (climb_mps < 0.2)
 
 
-@settings(max_examples=20)  # each is a flight of 120 ticks
-@given(climb_mps=st.floats(-0.45, 0.04))
-def test_a_vehicle_that_sinks_at_full_thrust_lands(climb_mps: float) -> None:
+@pytest.mark.parametrize(
+    ("phase", "for_s", "lands"),
+    [
+        (Phase.ALIGN, 1.9, False),
+        (Phase.ALIGN, 2.1, True),
+        (Phase.ASCEND, 3.9, False),  # the last part of a weak vehicle's climb
+        (Phase.ASCEND, 4.1, True),
+    ],
+)
+@settings(max_examples=10)  # each is a flight of up to 200 ticks
+@given(climb_mps=st.floats(-0.2, 0.1))
+def test_a_vehicle_that_sinks_or_crawls_at_full_thrust_lands(
+    phase: Phase, for_s: float, lands: bool, climb_mps: float
+) -> None:
     """Sinking is no fall that full thrust would end: seed 21011139 went on along the floor."""
-    state = flown_at_full_thrust(state_in(Phase.ALIGN), 2.3, 1.3, climb_mps)
-    assert (state.transition_name, state.phase) == ("too-weak", Phase.LANDING)
+    weak = remembering(state_in(phase, z_m=1.1), hover_thrust=62500.0)
+    aside_m = 0.2 if phase is Phase.ALIGN else 0.0  # it neither has aligned nor leaves the cone
+    state = flown_at_full_thrust(weak, for_s, 1.1, climb_mps, aside_m)
+    assert (state.transition_name == "too-weak") is lands
+
+
+@pytest.mark.parametrize(("phase", "slow"), [(Phase.ALIGN, True), (Phase.PERCH, False)])
+def test_a_press_is_no_flight_on_too_little_thrust(phase: Phase, slow: bool) -> None:
+    c = context_at(state_in(phase), at(thrust=float(FULL_THRUST))(BEGIN_S), PROFILE)
+    assert SLOW_AT_FULL_THRUST.predicate(c.belief) is slow
 
 
 @pytest.mark.parametrize(
@@ -209,7 +228,7 @@ def test_a_press_ends_before_the_turn_that_would_be_too_late(late_s: float) -> N
 def test_what_backs_off_from_a_press_is_not_held_to_it() -> None:
     """Late turns hold a vehicle in place: by the press's own setpoint they would press on."""
     t_s = 10.1 + PROFILE.planner.perch.timeout_s
-    saturated = {THRUST_SATURATED_WITHOUT_CLIMB: 10.5}
+    saturated = {SLOW_AT_FULL_THRUST: 10.5}
     above = state_in(Phase.PERCH, 10.0, CONTACT_Z_M + 0.25)
     state = remembering(
         above, condition_start_times_s=saturated, catch_setpoint_height_above_vehicle_m=None

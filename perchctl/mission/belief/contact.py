@@ -42,6 +42,10 @@ press goes undetected. Smaller: a gust or a sagging battery looks like a press."
 MIN_SATURATED_TO_FULL_THRUST_RATIO = 0.98
 """Fraction of full thrust above which the motors are saturated, so that the thrust no longer shows
 how much the vehicle needs."""
+MIN_NEARLY_FULL_THRUST_RATIO = 0.96
+"""Fraction of full thrust that a vehicle with enough thrust needs only to climb. With less than 4 %
+to spare, it sinks by half a metre after each interruption of its setpoints. Larger: such a vehicle
+goes on until it falls to the floor. Smaller: weak vehicles that can perch land."""
 MAX_RAW_THRUST = 60000.0
 """Largest raw thrust that the firmware applies, 0..65535."""
 MIN_REPORTED_TO_COMMANDED_PRESS_THRUST_RATIO = 0.99
@@ -65,7 +69,7 @@ MAX_MOTIONLESS_CLIMB_RATE_MPS = 0.05
 """Vertical speed below which the vehicle counts as motionless, m/s. Larger: a slow descent looks
 like hanging."""
 MIN_CLIMB_RATE_AT_FULL_THRUST_MPS = 0.2
-"""Climb rate that any vehicle with enough thrust to hover exceeds at full thrust, m/s: at full
+"""Climb rate that any vehicle with enough thrust to hover soon exceeds at full thrust, m/s: at full
 thrust, the weakest vehicles that can perch take off at 0.3 to 0.5 m/s. Larger: such a vehicle lands
 at once. Smaller: a vehicle that only the ground effect lifts rises further before it sinks."""
 MAX_HOVER_SPEED_MPS = 0.3
@@ -500,14 +504,10 @@ def _does_imu_show_support(b: Belief) -> bool:
     )
 
 
-def _is_thrust_saturated(b: Belief) -> bool:
-    full = b.telemetry.thrust >= MIN_SATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
-    return full and b.climb_mps < MAX_MOTIONLESS_CLIMB_RATE_MPS
-
-
 def _is_slow_at_full_thrust(b: Belief) -> bool:
-    full = b.telemetry.thrust >= MIN_SATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
-    return full and b.climb_mps < MIN_CLIMB_RATE_AT_FULL_THRUST_MPS
+    full = b.telemetry.thrust >= MIN_NEARLY_FULL_THRUST_RATIO * FULL_THRUST
+    flies = b.command_history.maneuver.is_in_free_air
+    return flies and full and b.climb_mps < MIN_CLIMB_RATE_AT_FULL_THRUST_MPS
 
 
 TARGET_CONTACT = Condition(
@@ -551,20 +551,14 @@ IMU_SHOWS_SUPPORT = Condition(
 )
 """Something is supporting the vehicle, or it is pressing against something: proven by accelerometer
 and thrust alone."""
-THRUST_SATURATED_WITHOUT_CLIMB = Condition(
-    "thrust at its limit",
-    _is_thrust_saturated,
-    persists_across_phases=True,
-    required_data=RequiredData.TELEMETRY,
-)
-"""The thrust is at its limit, and the vehicle is not climbing."""
 SLOW_AT_FULL_THRUST = Condition(
-    "slow at full thrust",
+    "slow at nearly full thrust",
     _is_slow_at_full_thrust,
     persists_across_phases=True,
     required_data=RequiredData.TELEMETRY,
 )
-"""The thrust is at its limit, and the vehicle climbs more slowly than one that can hover."""
+"""The thrust is nearly at its limit in free air, and the vehicle climbs more slowly than one that
+can hover with thrust to spare."""
 SUPPORT_CONDITIONS = (
     TARGET_CONTACT,
     MAGNET_HOLDS_VEHICLE,
@@ -576,7 +570,6 @@ SUPPORT_CONDITIONS = (
     ON_FLOOR,
     CLIMB_BLOCKED,
     IMU_SHOWS_SUPPORT,
-    THRUST_SATURATED_WITHOUT_CLIMB,
     SLOW_AT_FULL_THRUST,
 )
 """All conditions defined in this module."""
