@@ -303,6 +303,7 @@ def test_a_flight_with_a_camera_that_mirrors_perches() -> None:
         ("sim", 20951311),  # much resistance: the pack looked empty without its resting voltage
         ("sim", 20951321),  # its landing was to end before the firmware reports low power
         ("target_only", 20961144),  # the target was learned while the attitude still settled
+        ("extreme", 21231252),  # by its drifted height it had come off the magnet
     ],
 )
 def test_a_flight_that_was_refused_or_landed_without_need_perches(

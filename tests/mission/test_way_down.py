@@ -56,7 +56,7 @@ from tests.helpers.mission import (
     target_at,
     telemetry,
 )
-from tests.mission.rig import BEGIN_S, TICK_S, Look, Motors, at, fly, is_setpoint
+from tests.mission.rig import BEGIN_S, TICK_S, Look, Motors, at, fly, is_setpoint, times
 
 SINKS = (0.0, 0.0, -0.5)
 OFF: dict[str, Any] = {"thrust": 0.0, "supervisor": READY}
@@ -671,3 +671,19 @@ def test_what_stands_still_is_telemetry_that_grows_old(frozen: dict[str, Any]) -
     assert flight.state.transition_name == "telemetry-stale"
     last_stale_s = PROFILE.safety.telemetry_land_s
     assert flight.ticks[-1].t_s - BEGIN_S == pytest.approx(last_stale_s, abs=0.1)
+
+
+@pytest.mark.parametrize(("drift_m", "descended_m", "leaves"), [
+    (0.0, 0.0, False), (0.0, 0.06, True), (0.08, 0.0, False), (0.08, 0.06, True),
+])  # fmt: skip
+def test_only_its_own_way_down_takes_a_vehicle_off_its_contact(
+    drift_m: float, descended_m: float, leaves: bool
+) -> None:
+    """An estimate that sank during the contact does not: extreme seed 21231252 still hung."""
+    begins_m = HANG_Z_M - drift_m
+    state = remembering(
+        state_in(Phase.RECOVER, z_m=begins_m), vehicle_world_z_at_last_contact_m=HANG_Z_M
+    )
+    for t_s in times(0.1):
+        state, _ = step_mission(state, at(begins_m - descended_m)(t_s), PROFILE)
+    assert (state.belief.vehicle_world_z_at_last_contact_m is None) is leaves

@@ -124,11 +124,11 @@ def act_in_recover(c: Context) -> Action:
     if (caught := catch_falling_vehicle(c)) is not None:
         return caught
     recover = c.planner.recover
-    c = Context(
-        forget_contact_when_below(
-            c.state, min(MIN_DISTANCE_BELOW_CONTACT_TO_RECOVER_M, 0.5 * recover.descend_m)
-        )
-    )
+    least_m = min(MIN_DISTANCE_BELOW_CONTACT_TO_RECOVER_M, 0.5 * recover.descend_m)
+    # Over a contact of some seconds, the estimate may drift downwards by as much. In this phase,
+    # the vehicle itself must have descended.
+    if c.state.entry.position_m[2] - c.telemetry.position_m[2] >= least_m:
+        c = Context(forget_contact_when_below(c.state, least_m))
     state, away = end_press(c)
     if away is not None:
         return state, away
