@@ -14,7 +14,8 @@ from perchctl.mission.belief.contact import (
     HANGING,
     HANGING_CONFIRMATION_DWELL_S,
     MIN_SATURATED_TO_FULL_THRUST_RATIO,
-    SLOW_AT_FULL_THRUST,
+    NOT_CLIMBING_AT_FULL_THRUST,
+    SLOW_AT_NEARLY_FULL_THRUST,
     Support,
     contact_height_tolerance_m,
     gear_to_target_at_last_touch_or_now,
@@ -91,10 +92,10 @@ TARGET_BELOW_VEHICLE_DWELL_S = 0.3
 SLOW_HOVER_DWELL_S = 2.0
 """Time at nearly full thrust after which a vehicle that hovers has too little thrust, s. Larger: it
 sinks to the floor from a greater height. Smaller: a gust makes a weak vehicle land."""
-SLOW_ASCENT_DWELL_S = 4.0
-"""Time at nearly full thrust after which a vehicle that should climb has too little thrust, s; a
-weak vehicle that can perch climbs the last part slowly. Larger: it sinks further before it lands.
-Smaller: it lands just below the target."""
+NOT_CLIMBING_DWELL_S = 2.0
+"""Time at full thrust after which a vehicle that does not climb has too little thrust for a press,
+or is pressing against something, s. Larger: it presses for longer. Smaller: a gust makes a weak
+vehicle land."""
 SLOW_TAKEOFF_DWELL_S = 1.0
 """Time at full thrust after which a vehicle that takes off too slowly cannot fly, s; the weakest
 vehicles that can perch reach full thrust for up to 0.4 s. Larger: the vehicle sinks to the floor
@@ -328,16 +329,18 @@ def is_climb_blocked_off_target(c: Context) -> bool:
 
 
 def is_thrust_insufficient_for_takeoff(c: Context) -> bool:
-    """True if the vehicle has taken off too slowly at full thrust for `SLOW_TAKEOFF_DWELL_S`: only
-    the ground effect or a battery that is still rested lifts it, and it would soon sink back."""
-    return c.true_for_s(SLOW_AT_FULL_THRUST) >= SLOW_TAKEOFF_DWELL_S
+    """True if the vehicle has taken off too slowly at nearly full thrust for
+    `SLOW_TAKEOFF_DWELL_S`: only the ground effect or a battery that is still rested lifts it, and
+    it would soon sink back."""
+    return c.true_for_s(SLOW_AT_NEARLY_FULL_THRUST) >= SLOW_TAKEOFF_DWELL_S
 
 
 def is_thrust_insufficient(c: Context) -> bool:
     """True if no thrust remains to fly on or to press, measured or predicted. Measured: the vehicle
-    has hardly climbed at nearly full thrust for `SLOW_HOVER_DWELL_S`, or for `SLOW_ASCENT_DWELL_S`
-    in an ascent. Predicted, at the stand-off before the press: hover thrust exceeds
-    `MIN_SATURATED_TO_FULL_THRUST_RATIO` times the largest press thrust.
+    has not climbed at full thrust for `NOT_CLIMBING_DWELL_S`, or has hardly climbed at nearly full
+    thrust for `SLOW_HOVER_DWELL_S`. In an ascent, only the first counts, since a weak vehicle that
+    can perch climbs the last part slowly. Predicted, at the stand-off before the press: hover
+    thrust exceeds `MIN_SATURATED_TO_FULL_THRUST_RATIO` times the largest press thrust.
 
     A mission that hovers does not press, so nothing is predicted for it. False while a press is
     being ended.
@@ -345,8 +348,9 @@ def is_thrust_insufficient(c: Context) -> bool:
     if c.state.must_end_press:
         return False
     ascends = c.state.phase is Phase.ASCEND
-    dwell_s = SLOW_ASCENT_DWELL_S if ascends else SLOW_HOVER_DWELL_S
-    if c.true_for_s(SLOW_AT_FULL_THRUST) >= dwell_s:
+    if c.true_for_s(NOT_CLIMBING_AT_FULL_THRUST) >= NOT_CLIMBING_DWELL_S:
+        return True
+    if not ascends and c.true_for_s(SLOW_AT_NEARLY_FULL_THRUST) >= SLOW_HOVER_DWELL_S:
         return True
     near = ascends and c.true_for_s(NEAR_STANDOFF_HEIGHT) >= 0.0
     near = near and c.planner.hover is None

@@ -504,7 +504,13 @@ def _does_imu_show_support(b: Belief) -> bool:
     )
 
 
-def _is_slow_at_full_thrust(b: Belief) -> bool:
+def _is_not_climbing_at_full_thrust(b: Belief) -> bool:
+    full = b.telemetry.thrust >= MIN_SATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
+    flies = b.command_history.maneuver.is_in_free_air
+    return flies and full and b.climb_mps < MAX_MOTIONLESS_CLIMB_RATE_MPS
+
+
+def _is_slow_at_nearly_full_thrust(b: Belief) -> bool:
     full = b.telemetry.thrust >= MIN_NEARLY_FULL_THRUST_RATIO * FULL_THRUST
     flies = b.command_history.maneuver.is_in_free_air
     return flies and full and b.climb_mps < MIN_CLIMB_RATE_AT_FULL_THRUST_MPS
@@ -551,9 +557,17 @@ IMU_SHOWS_SUPPORT = Condition(
 )
 """Something is supporting the vehicle, or it is pressing against something: proven by accelerometer
 and thrust alone."""
-SLOW_AT_FULL_THRUST = Condition(
+NOT_CLIMBING_AT_FULL_THRUST = Condition(
+    "not climbing at full thrust",
+    _is_not_climbing_at_full_thrust,
+    persists_across_phases=True,
+    required_data=RequiredData.TELEMETRY,
+)
+"""The thrust is at its limit in free air, and the vehicle is not climbing: it is too weak, or
+something is above it."""
+SLOW_AT_NEARLY_FULL_THRUST = Condition(
     "slow at nearly full thrust",
-    _is_slow_at_full_thrust,
+    _is_slow_at_nearly_full_thrust,
     persists_across_phases=True,
     required_data=RequiredData.TELEMETRY,
 )
@@ -570,7 +584,8 @@ SUPPORT_CONDITIONS = (
     ON_FLOOR,
     CLIMB_BLOCKED,
     IMU_SHOWS_SUPPORT,
-    SLOW_AT_FULL_THRUST,
+    NOT_CLIMBING_AT_FULL_THRUST,
+    SLOW_AT_NEARLY_FULL_THRUST,
 )
 """All conditions defined in this module."""
 
