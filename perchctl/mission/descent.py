@@ -518,7 +518,8 @@ def _command_onboard_landing(c: Context) -> Action:
         and tel.has_bit(HL_ACTIVE)
     )
     flies_below_ground = (
-        b.height_m < -MIN_DEPTH_BELOW_GROUND_TO_EXTEND_LANDING_M
+        all(map(math.isfinite, tel.position_m))
+        and b.height_m < -MIN_DEPTH_BELOW_GROUND_TO_EXTEND_LANDING_M
         and tel.thrust >= MIN_THRUST_TO_HOVER_RATIO_IF_FLYING * b.hover_thrust
     )
     extension_count = state.descent.onboard_landing_extension_count

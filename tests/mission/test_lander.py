@@ -374,6 +374,12 @@ def test_a_landing_that_has_reached_the_floor_or_is_above_it_is_not_drawn_out(
     assert [type(command) for command in commands] == [Land] * 3
 
 
+def test_a_landing_is_not_drawn_out_at_a_place_that_is_no_number() -> None:
+    nowhere = (math.nan, 0.0, -0.3)
+    commands = landed_onboard(-0.3, 10.0, thrust=HOVER_THRUST, position_m=nowhere)
+    assert not any(isinstance(command, PositionSetpoint) for _, command in commands)
+
+
 def test_a_landing_is_drawn_out_a_few_times_only() -> None:
     """A vehicle that never arrives is one that its estimate carries upwards."""
     commands = landed_onboard(-0.3, 25.0, thrust=HOVER_THRUST)
