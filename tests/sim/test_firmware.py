@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from perchctl.geometry import GRAVITY_MPS2, Array
 from perchctl.sim.firmware import Firmware
 from perchctl.sim.firmware.controller import Setpoint
+from perchctl.sim.firmware.variables import LOG_VARIABLES
 from perchctl.vehicle import CRASHED
 from tests.helpers.firmware_rig import PERFECT, Rig, at_height, make_rig, raw_thrust
 
@@ -201,3 +203,21 @@ def test_a_tilt_that_is_wrong_slides() -> None:
     four_m = abs(errors_m(rig)[0])
     assert 0.2 < four_m < 0.6  # the bias alone: 0.36 m
     assert four_m > 4.0 * two_m
+
+
+@pytest.mark.parametrize(("engaged", "thrust", "noisy"), [
+    (True, 0.0, True), (True, 1000.0, True), (True, 20000.0, False), (False, 0.0, False),
+])  # fmt: skip
+def test_a_hanging_vehicle_s_attitude_never_repeats(
+    engaged: bool, thrust: float, noisy: bool
+) -> None:
+    """perchctl takes readings that repeat for frozen ones, and landed a vehicle that hung still."""
+    now = SimpleNamespace(roll_deg=1.0, gyro_x_dps=0.08)
+    firmware = SimpleNamespace(
+        estimator=SimpleNamespace(now=now),
+        world=SimpleNamespace(magnet_engaged=engaged),
+        controller=SimpleNamespace(thrust=thrust),
+    )
+    read = LOG_VARIABLES["stateEstimate.roll"].read(firmware)
+    assert (read != 1.0) is noisy
+    assert read == pytest.approx(1.0, abs=0.01)

@@ -16,6 +16,11 @@ from perchctl.sim.firmware.outside import POSITION_STATE, VELOCITY_STATE
 
 LOG_COUNT = 385
 PARAMETER_COUNT = 257
+IDLE_THRUST = 1000
+"""Largest thrust command at which the motors stand still, 0..65535."""
+GYRO_NOISE_S = 0.02
+"""Time over which the attitude integrates a sample of the gyroscope's noise, s. Larger: a hanging
+vehicle seems to move. Smaller: a rounded reading may repeat."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +97,24 @@ def _item(path: str, place: int, ctype: str = "float") -> LogVariable:
     return LogVariable(ctype, lambda firmware: float(read(firmware)[place]))
 
 
+def _angle(name: str, gyro_axis: str) -> LogVariable:
+    """An angle of the estimate, in degrees.
+
+    Dry friction holds a hanging vehicle perfectly still, and the estimator's true attitude with it.
+    A real estimate integrates the noise of the gyroscope (some 0.001 deg), so no reading is like
+    the one before, and perchctl takes readings that repeat for frozen ones. While the vehicle hangs
+    with its motors idle, the reading therefore contains that noise.
+    """
+    read = attrgetter(f"estimator.now.{name}_deg")
+    gyro = attrgetter(f"estimator.now.gyro_{gyro_axis}_dps")
+
+    def reading(firmware: Any) -> float:
+        still = firmware.world.magnet_engaged and firmware.controller.thrust <= IDLE_THRUST
+        return float(read(firmware)) + (GYRO_NOISE_S * gyro(firmware) if still else 0.0)
+
+    return LogVariable("float", reading)
+
+
 def _variance(state: int) -> LogVariable:
     return LogVariable("float", lambda firmware: firmware.estimator.variance(firmware.t_s, state))
 
@@ -113,8 +136,8 @@ for _i, _axis in enumerate("xyz"):
         f"acc.{_axis}": _item("estimator.acc_g", _i),
         f"gyro.{_axis}": _field(f"estimator.now.gyro_{_axis}_dps"),
     }
-for _angle in ("roll", "pitch", "yaw"):
-    LOG_VARIABLES[f"stateEstimate.{_angle}"] = _field(f"estimator.now.{_angle}_deg")
+for _name, _axis in (("roll", "x"), ("pitch", "y"), ("yaw", "z")):
+    LOG_VARIABLES[f"stateEstimate.{_name}"] = _angle(_name, _axis)
 LOG_VARIABLES |= {
     f"debugCtr.c{_i}": LogVariable("uint32_t") for _i in range(LOG_COUNT - len(LOG_VARIABLES))
 }
