@@ -29,13 +29,7 @@ class TargetPose(Node):
         self._poses = self.create_publisher(PoseWithCovarianceStamped, "target_pose", 10)
         self._transforms = TransformBroadcaster(self)
         self._receiver, self._note = receiver, ""
-        try:
-            receiver.bind((host, port))
-        except OSError as error:
-            raise SystemExit(
-                f"no poses can be received at {host}:{port}: {error.strerror}; set the parameters "
-                f"host and port to those of perchctl track --udp, and stop other receivers"
-            ) from error
+        receiver.bind((host, port))
         receiver.settimeout(0.1)  # s; without poses, the node serves Ctrl-C at this interval
 
     def receive(self) -> None:

@@ -174,13 +174,6 @@ def test_the_node_ends_with_ros_or_by_ctrl_c_and_waits_for_poses(
     patch.setattr(ros, "error", None)
 
 
-def test_a_port_that_is_in_use_is_one_sentence(node: tuple[Ros2, ModuleType], port: int) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(("127.0.0.1", port))
-        with pytest.raises(SystemExit, match=f"127.0.0.1:{port}: Address already in use; set the"):
-            published(node, port)
-
-
 def test_a_foreign_datagram_is_reported_once_and_does_not_end_the_node(
     node: tuple[Ros2, ModuleType], port: int
 ) -> None:
