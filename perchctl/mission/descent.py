@@ -434,8 +434,8 @@ def _descend_by_raw_thrust(c: Context) -> Action:
 
     In a tick in which the estimated heading jumps, one setpoint with the new heading is sent
     instead. Under raw thrust, the firmware keeps the heading setpoint that it received last, so it
-    would turn the vehicle by the jump. Such a turn saturates the motors and costs up to a tenth of
-    the lift. No setpoint is sent to a vehicle that is so low that the setpoint would be above it.
+    would turn the vehicle by the jump. Such a turn saturates two motors, which reduces the lift. No
+    setpoint is sent to a vehicle that is so low that the setpoint would be above it.
     """
     descent, b = c.state.descent, c.belief
     if (
