@@ -16,11 +16,9 @@ from perchctl.mission import Phase
 from perchctl.profile import Profile, TargetConfig
 from perchctl.sim import (
     CONTROL_PERIOD_S,
-    MOTOR_FORCE_N,
     CaptureSettings,
     Scenario,
     SimulatedVehicle,
-    max_thrust_n,
 )
 from perchctl.vehicle import LOCKED
 from perchctl.vision import CameraModel
@@ -216,8 +214,7 @@ class FactsRecorder(Facts):
     def _note_power(self, s: Sample) -> None:
         """Record when four times the thrust of the weakest motor no longer lifts the weight."""
         vehicle, world = self._vehicle, self._vehicle.world
-        weakest = min(world.powertrain.strength or (1.0,))
-        lift_n = min(4.0 * MOTOR_FORCE_N, weakest * max_thrust_n(world.battery_rest_v))
+        lift_n = world.powertrain.max_balanced_thrust_n()
         weight_n = vehicle.scenario.mass_kg * GRAVITY_MPS2
         if self.weak_s is None and lift_n < LEAST_LIFT * weight_n:
             self.weak_s = s.t_s

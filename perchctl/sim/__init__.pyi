@@ -3,7 +3,6 @@ from .capture import CaptureSettings as CaptureSettings
 from .capture import draw_capture as draw_capture
 from .downwash import downwash_mps as downwash_mps
 from .powertrain import MOTOR_FORCE_N as MOTOR_FORCE_N
-from .powertrain import max_thrust_n as max_thrust_n
 from .powertrain import thrust_n as thrust_n
 from .process import SimProcess as SimProcess
 from .renderer import Renderer as Renderer

@@ -152,7 +152,11 @@ class Cell:
         self._left -= current_a * self._per_step
         self._slow_v += self._slowly * (self._slow_ohm * current_a - self._slow_v)
         self.rest_v = _resting_v(self._left, self._knee) + self._offset_v
-        self.battery_v = self.rest_v - self._ohm * current_a - self._slow_v
+        self.battery_v = self.voltage_at(current_a)
+
+    def voltage_at(self, current_a: float) -> float:
+        """Return the voltage under load, V, if the current changed to `current_a` now."""
+        return self.rest_v - self._ohm * current_a - self._slow_v
 
 
 def _resting_v(left: float, knee: float) -> float:
@@ -210,7 +214,7 @@ class Powertrain:
         self._brakes = scenario.motors_brake
         self._coasting = 1.0 - math.exp(-CONTROL_PERIOD_S / MOTOR_COAST_S)
         curve = scenario.airframe.thrust
-        self._thrust_n = steady_thrust(curve)
+        self._thrust_n, self._most_n = steady_thrust(curve), curve.most_n
         hover_v = inverse_thrust(curve)(0.042 * GRAVITY_MPS2 / 4.0)
         self._per_v = ((CONTROL_PERIOD_S / MOTOR_LAG_S) ** 2 - _STANDING) / hover_v
 
@@ -232,6 +236,16 @@ class Powertrain:
         self.cell.step(_AMPERES_PER_N * (f1 + f2 + f3 + f4))
         return self.forces_n
 
+    def max_balanced_thrust_n(self) -> float:
+        """Return the steady thrust of four motors as strong as the weakest one, at full duty with
+        the cell as it is now. Stronger motors cannot add to it, since the vehicle would tilt."""
+        cell, weakest = self.cell, min(self.strength or (1.0,))
+        battery_v = cell.battery_v
+        for _ in range(30):
+            forces_n = weakest * min(4.0 * self._thrust_n(battery_v), 4.0 * self._most_n)
+            battery_v += 0.5 * (cell.voltage_at(_AMPERES_PER_N * forces_n) - battery_v)
+        return forces_n
+
 
 class Fluctuation:
     """Fluctuations of the thrust of four motors, relative to their thrust."""
@@ -250,13 +264,3 @@ class Fluctuation:
         keep, take, (a, b, c, d) = self._keep, self._white.pop, self._now
         self._now = keep * a + take(), keep * b + take(), keep * c + take(), keep * d + take()
         return self._now
-
-
-def max_thrust_n(rest_v: float) -> float:
-    """Return the steady thrust of four motors at full duty with a cell that has this resting
-    voltage."""
-    battery_v = rest_v
-    for _ in range(30):
-        forces_n = 4.0 * thrust_n(battery_v)
-        battery_v += 0.5 * (rest_v - RESISTANCE_OHM * _AMPERES_PER_N * forces_n - battery_v)
-    return forces_n

@@ -93,12 +93,12 @@ class Recorded:
 
     def __init__(self, rest_v: float = 4.1, effects: tuple[Effect, ...] = ()) -> None:
         self.magnet = SimpleNamespace(let_go=False)
+        self.lift_n = 0.45
         self.planner = SimpleNamespace(active=False)
         self.supervisor = SimpleNamespace(emergency=False)
         self.world = SimpleNamespace(
             magnet=self.magnet,
-            powertrain=SimpleNamespace(strength=None),
-            battery_rest_v=rest_v,
+            powertrain=SimpleNamespace(max_balanced_thrust_n=lambda: self.lift_n),
             battery_v=rest_v - 0.5,
         )
         vehicle: Any = SimpleNamespace(
@@ -185,7 +185,7 @@ def test_a_slip_from_still_motors_is_kept_with_its_height() -> None:
 def test_when_nothing_lifts_it_any_more() -> None:
     it = Recorded().show(HOVER, 0.5)
     assert (it.facts.weak_s, it.facts.battery_low_s) == (None, None)
-    it.world.battery_rest_v, it.world.battery_v = 3.3, 2.9
+    it.lift_n, it.world.battery_v = 0.39, 2.9
     it.show(HOVER, 0.5, height_m=1.2)
     assert it.facts.weak_s == pytest.approx(0.5)
     assert (it.facts.battery_low_s, it.facts.battery_low_m) == (pytest.approx(0.5), 1.2)

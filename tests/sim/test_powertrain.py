@@ -4,13 +4,22 @@ old, slow when cold."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.sim import CONTROL_PERIOD_S
+from perchctl.sim import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.firmware.controller import MOTORS_OFF, MotorDriver
-from perchctl.sim.powertrain import MOTOR_FORCE_N, STANDSTILL_V, Cell, motor_voltage, thrust_n
+from perchctl.sim.powertrain import (
+    MOTOR_FORCE_N,
+    STANDSTILL_V,
+    Cell,
+    Powertrain,
+    motor_voltage,
+    thrust_n,
+)
 
 HOVER_A = 3.8
 LEVELS_V = (3.78, 3.83, 3.87, 3.89, 3.92, 3.96, 4.00, 4.04, 4.10)
@@ -62,3 +71,29 @@ def test_it_starts_at_the_resting_voltage_that_is_asked_for(knee: float) -> None
     for rest_v in (3.3, 3.6, 3.85, 4.0, 4.2):
         cell = Cell(rest_v, knee=knee)
         assert after(cell, CONTROL_PERIOD_S) == pytest.approx(rest_v, abs=1e-3)
+
+
+@given(
+    st.floats(3.3, 4.2),
+    st.floats(0.1, 0.3),
+    st.floats(0.0, 0.1),
+    st.tuples(*[st.floats(0.8, 1.2)] * 4),
+)
+def test_most_thrust_is_what_full_duty_gives(
+    rest_v: float, ohm: float, slow_ohm: float, strength: tuple[float, float, float, float]
+) -> None:
+    """An old cell with a large resistance lifts less at the same resting voltage."""
+    scenario = replace(
+        Scenario(),
+        battery_rest_v=rest_v,
+        cell_resistance_ohm=ohm,
+        cell_slow_ohm=slow_ohm,
+        motor_strength=(min(strength),) * 4,
+    )
+    powertrain = Powertrain(scenario)
+    for _ in range(500):
+        powertrain.step((65535.0,) * 4)
+    most_n = min(sum(powertrain.forces_n), 4.0 * min(strength) * MOTOR_FORCE_N)
+    assert powertrain.max_balanced_thrust_n() == pytest.approx(most_n, rel=0.01)
+    powertrain.strength = strength
+    assert powertrain.max_balanced_thrust_n() == pytest.approx(most_n, rel=0.01)
