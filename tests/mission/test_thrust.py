@@ -9,7 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.mission import Observation, OperatorRequest, Outcome, Phase, PlannerState, planner
+from perchctl.mission import (
+    ImuMotion,
+    Observation,
+    OperatorRequest,
+    Outcome,
+    Phase,
+    PlannerState,
+    planner,
+)
 from perchctl.mission.belief.contact import (
     MAGNET_HOLDS_VEHICLE,
     NOT_CLIMBING_AT_FULL_THRUST,
@@ -216,6 +224,24 @@ def test_a_reading_that_stands_still_under_a_changed_order_is_stale(
         state = replace(observing(state, obs, PROFILE), t_s=t_s)
     b = state.belief
     assert b.is_reported_thrust_reliable is MAGNET_HOLDS_VEHICLE.predicate(b) is known
+
+
+@given(st.floats(0.0, 3.0))
+def test_a_long_press_is_released_at_once(pressed_s: float) -> None:
+    """The integrator of the firmware has wound up by then: with a release in steps, a press whose
+    thrust was not reported at first lasted 4.2 s (seed 2612010094)."""
+    state = state_in(Phase.COMPLETE, z_m=CONTACT_Z_M)
+    imu = ImuMotion(climb_rate_became_steady_at_s=BEGIN_S - pressed_s)
+    pressed = at(CONTACT_Z_M, obs={"imu": imu}, thrust=float(FULL_THRUST))
+    first, *_, last = fly(state, pressed, 1.0).commands
+    assert isinstance(first, PositionSetpoint)
+    assert isinstance(last, PositionSetpoint)
+    drop_m = PROFILE.planner.complete.release_drop_m
+    assert last.z_m == pytest.approx(CONTACT_Z_M - drop_m)
+    if pressed_s > 1.5:
+        assert first.z_m == pytest.approx(last.z_m)
+    elif pressed_s < 1.45:
+        assert first.z_m > CONTACT_Z_M
 
 
 def pressed_late(t_s: float, late_s: float) -> Observation:
