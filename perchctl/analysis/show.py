@@ -27,6 +27,7 @@ def show_record(flight: FlightAnalysis) -> dict[str, Any]:
         **{key: header.get(key) for key in ("version", "perchctl", "started_utc", "uri", "source")},
         "profile": log.profile_name,
         "seed": header.get("seed"),
+        "fault": log.injected_fault,
         "whole": not log.truncated,
         "ignored_bytes": log.ignored_bytes,
         **end.as_record(),
@@ -49,7 +50,10 @@ def _times(part: Any) -> dict[str, Any]:
 
 def show_text(flight: FlightAnalysis) -> str:
     """Return a flight's outcome, figures, phases, holds and takeovers as text for a terminal."""
-    lines = [*_end_lines(flight), *_named("record", _origin(flight.log)), *_measure_lines(flight)]
+    lines = [*_end_lines(flight), *_named("record", _origin(flight.log))]
+    if flight.log.injected_fault is not None:
+        lines += _named("fault", f"injected: {flight.log.injected_fault}")
+    lines += _measure_lines(flight)
     lines += _trim_lines(flight)
     phases = flight.log.phases
     for head, rows in (

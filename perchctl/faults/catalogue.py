@@ -574,9 +574,31 @@ class Case:
     first_hold_ratio: float | None = None
 
     @property
+    def text(self) -> str | None:
+        """The fault, its time and the values drawn for it, in words; None without a fault."""
+        if not self.effects:
+            return None
+        begins = f"{self.moment_s:.1f} s after {self.phase.value} began"
+        if self.fault.phases == FROM_THE_START:
+            begins = "from the start"
+        drawn = "; ".join(map(_effect_text, self.effects))
+        return f"{self.fault.name}, {begins}: {self.fault.description} ({drawn})"
+
+    @property
     def lasts_s(self) -> float:
         """Duration of a common cause (a fault that affects several vehicles at once), s."""
         return max(float(effect.keywords["for_s"]) for effect in self.effects)
+
+
+def _effect_text(effect: e.Effect) -> str:
+    values = (f"{name}={_value_text(value)}" for name, value in effect.keywords.items())
+    return ": ".join(filter(None, (effect.func.__name__, ", ".join(values))))
+
+
+def _value_text(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"({', '.join(map(_value_text, value))})"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 HEALTHY = Case(NO_FAULT, P.APPROACH, 0.0, ())

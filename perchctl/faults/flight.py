@@ -321,7 +321,9 @@ def fly_with_fault(
     log, if any. Errors: NotFound, InvalidValue (calibration, log)."""
     flown_by = e.apply_to_profile(profile, case.effects)
     watcher = (
-        None if log is None else LogWatcher.open_lockstep(log, flown_by, scenario.seed, record)
+        None
+        if log is None
+        else LogWatcher.open_lockstep(log, flown_by, scenario.seed, record, case.text)
     )
     return FaultyFlight(profile, case, scenario, watcher).fly()
 

@@ -37,13 +37,14 @@ def make_header(
     uri: str,
     source: str,
     seed: int | None = None,
+    fault: str | None = None,
     lockstep: bool = False,
     started: datetime | None = None,
     t0_s: float = 0.0,
 ) -> dict[str, Any]:
     """The first record of a log. Without `started`, it depends only on the other arguments and on
     the files named in the profile. `t0_s` is the time on the loop's clock at the start of the
-    log."""
+    log. `fault` describes the fault that is injected into a simulated flight, if any."""
     return {
         "kind": "header",
         "format": FORMAT,
@@ -52,6 +53,7 @@ def make_header(
         "uri": uri,
         "source": without_password(source),
         "seed": seed,
+        **({} if fault is None else {"fault": fault}),
         "lockstep": lockstep,
         "started_utc": started.astimezone(UTC).isoformat(timespec="seconds") if started else None,
         "t0_s": t0_s,

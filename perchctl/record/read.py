@@ -253,6 +253,13 @@ class FlightLog:
         return f"profile {self.profile_name or '?'}" + ("" if seed is None else f", seed {seed}")
 
     @property
+    def injected_fault(self) -> str | None:
+        """Description of the fault that was injected into a simulated flight; None without one, and
+        in logs written before perchctl 0.4."""
+        fault = self.header.get("fault")
+        return None if fault is None else str(fault)
+
+    @property
     def flown_profile(self) -> Profile:
         """The flown profile, without passwords. A `Note` warns about each key that has become a
         constant but was flown with another value. Errors: InvalidValue."""

@@ -121,11 +121,18 @@ class LogWatcher:
 
     @classmethod
     def open_lockstep(
-        cls, path: Path, profile: Profile, seed: int, record: bool = False
+        cls,
+        path: Path,
+        profile: Profile,
+        seed: int,
+        record: bool = False,
+        fault: str | None = None,
     ) -> LogWatcher:
-        """Open the log of a simulated flight. The same seed gives the same bytes. Errors:
-        InvalidValue."""
-        header = make_header(profile, uri="sim://", source="sim:", seed=seed, lockstep=True)
+        """Open the log of a simulated flight. The same seed gives the same bytes. `fault` describes
+        the injected fault, if any. Errors: InvalidValue."""
+        header = make_header(
+            profile, uri="sim://", source="sim:", seed=seed, fault=fault, lockstep=True
+        )
         return cls._opened(path, header, profile, record, live=False)
 
     @classmethod

@@ -85,6 +85,16 @@ def test_the_text_fits_a_terminal_and_obeys_nothing(tmp_path: Path) -> None:
     assert record["whole"]
 
 
+def test_an_injected_fault_is_named(tmp_path: Path) -> None:
+    fault = "kick, 1.7 s after ALIGN began: a blow (push: for_s=0.04)"
+    flight = FlightAnalysis(read_log(synthetic.write(tmp_path / "f.jsonl", {"fault": fault})))
+    assert f"injected: {fault}" in " ".join(show_text(flight).split())
+    assert show_record(flight)["fault"] == fault
+    healthy = FlightAnalysis(read_log(synthetic.write(tmp_path / "g.jsonl")))
+    assert "injected" not in show_text(healthy)
+    assert show_record(healthy)["fault"] is None
+
+
 def test_the_rows_that_were_taken_and_an_end_without_a_tick_are_told(tmp_path: Path) -> None:
     events = [
         Event(

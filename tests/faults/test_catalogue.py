@@ -13,7 +13,16 @@ import pytest
 
 from perchctl.errors import InvalidValue
 from perchctl.faults import FAULTS, select_faults
-from perchctl.faults.catalogue import AIR, BY_NAME, USUAL_S, Fault, draw_case, draw_fault_case
+from perchctl.faults.catalogue import (
+    AIR,
+    BY_NAME,
+    FROM_THE_START,
+    HEALTHY,
+    USUAL_S,
+    Fault,
+    draw_case,
+    draw_fault_case,
+)
 from perchctl.faults.oracle import emergency_stop_s
 from perchctl.flight import OperatorSwitch
 from perchctl.mission import OperatorRequest, Phase
@@ -35,6 +44,16 @@ def test_a_fault_is_well_formed(fault: Fault) -> None:
             assert (case.landed_from is not None) == (phase is Phase.LANDING)
             assert (case.first_hold_ratio is not None) == (phase is Phase.RECOVER)
             assert all(effect.keywords.get("for_s", 1.0) > 0.0 for effect in case.effects)
+            text = case.text or ""
+            assert text.startswith(fault.name)
+            assert fault.description in text
+            drawn = [key for effect in case.effects for key in effect.keywords]
+            assert all(f"{key}=" in text for key in drawn)
+            assert ("from the start" in text) == (fault.phases == FROM_THE_START)
+
+
+def test_a_flight_without_a_fault_names_none() -> None:
+    assert HEALTHY.text is None
 
 
 def rounded(value: Any) -> Any:

@@ -223,6 +223,8 @@ def test_a_killed_program_is_cut_and_excused(killed: tuple[FaultResult, Path]) -
 def test_the_log_ends_where_the_program_did(killed: tuple[FaultResult, Path]) -> None:
     result, log = killed
     lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
+    assert lines[0]["fault"].startswith("killed, ")
+    assert "s after ALIGN began: perchctl is killed (killed)" in lines[0]["fault"]
     ticks = [line["t_s"] for line in lines if line["kind"] == "tick"]
     assert ticks[-1] == pytest.approx(result.time_s, abs=0.05)
 
