@@ -125,7 +125,7 @@ class Belief:
     rotor_thrust: float | None = None
     #: time at which the reported thrust began to differ from the commanded one
     thrust_began_to_differ_from_command_at_s: float | None = None
-    #: last tick in which they had differed for longer than `MAX_THRUST_REPORT_DELAY_S`
+    #: last tick in which the two had differed for longer than `MAX_THRUST_REPORT_DELAY_S`
     thrust_last_differed_from_command_at_s: float = -math.inf
     battery_fit: BatteryFit = field(default_factory=BatteryFit)  #: state of the battery fit
 
@@ -348,13 +348,13 @@ class Belief:
     @property
     def ground_z_m(self) -> float:
         """World z, m, in the frame of the state estimate, of the position where the flight started;
-        0 if unknown. Wrong by as much as the estimated height has drifted since."""
+        0 if unknown. Its error is the drift of the estimated height since then."""
         return self.takeoff_position_m[2] if self.takeoff_position_m else 0.0
 
     @cached_property
     def height_m(self) -> float:
         """Estimated height above the position where the flight started, m: world z of the vehicle's
-        origin minus `ground_z_m`. Wrong by as much as the state estimate has drifted."""
+        origin minus `ground_z_m`. Its error is the drift of the state estimate."""
         return self.obs.telemetry.position_m[2] - self.ground_z_m
 
     @cached_property

@@ -43,15 +43,15 @@ MIN_SATURATED_TO_FULL_THRUST_RATIO = 0.98
 """Fraction of full thrust above which the motors are saturated, so that the thrust no longer shows
 how much the vehicle needs."""
 MIN_NEARLY_FULL_THRUST_RATIO = 0.96
-"""Fraction of full thrust that a vehicle with enough thrust needs only to climb. With less than 4 %
-to spare, it sinks by half a metre after each interruption of its setpoints. Larger: such a vehicle
-goes on until it falls to the floor. Smaller: weak vehicles that can perch land."""
+"""Fraction of full thrust that a sufficiently powerful vehicle needs only when it climbs. A vehicle
+with less than 4 % to spare sinks by half a metre after each interruption of its setpoints. Larger:
+such a vehicle goes on until it falls to the floor. Smaller: weak vehicles that can perch land."""
 MAX_RAW_THRUST = 60000.0
 """Largest raw thrust that the firmware applies, 0..65535."""
 MIN_REPORTED_TO_COMMANDED_PRESS_THRUST_RATIO = 0.99
 """Ratio of reported to commanded thrust at which a vehicle that presses by raw thrust always counts
 as pressing. Larger: a reading just below the commanded thrust goes undetected. Smaller: a heavy
-vehicle seems to press while it hovers."""
+vehicle seems to be pressing while it is hovering."""
 MAX_HOVER_TO_FULL_THRUST_RATIO_TO_DETECT_PRESS = 0.93
 """Hover thrust, as a fraction of full thrust, above which too little thrust remains to prove a
 press. Smaller: a press is never detected on a heavy vehicle."""
@@ -73,16 +73,17 @@ MIN_CLIMB_RATE_AT_FULL_THRUST_MPS = 0.2
 thrust, the weakest vehicles that can perch take off at 0.3 to 0.5 m/s. Larger: such a vehicle lands
 at once. Smaller: a vehicle that only the ground effect lifts rises further before it sinks."""
 MAX_HOVER_SPEED_MPS = 0.3
-"""Largest speed at which the thrust is hover thrust, m/s."""
+"""Largest speed at which the present thrust counts as hover thrust, m/s."""
 MAX_HOVER_CLIMB_RATE_MPS = 0.27
-"""Largest vertical speed at which the thrust is hover thrust, m/s."""
+"""Largest vertical speed at which the present thrust counts as hover thrust, m/s."""
 MAX_SPECIFIC_FORCE_DEVIATION_IN_HOVER_G = 0.1
-"""Largest deviation of the specific force from 1 g at which the thrust is hover thrust, g."""
+"""Largest deviation of the specific force from 1 g at which the present thrust counts as hover
+thrust, g."""
 MAX_HEIGHT_DRIFT_RATE_IN_PRESS_MPS = 0.1
 """Rate at which a pressed vehicle's estimated height may drift, m/s. Larger: a contact far from the
 target is accepted. Smaller: a true contact is rejected if the last sighting is old."""
 MIN_SETPOINT_HEIGHT_ABOVE_VEHICLE_TO_PRESS_M = 0.08
-"""Distance of the setpoint above a motionless vehicle from which the vehicle must be pressing
+"""Distance of the setpoint above a motionless vehicle beyond which the vehicle must be pressing
 against whatever blocks it, m. Larger: a blocked climb is detected late."""
 GEAR_DISPLACEMENT_BY_TOUCH_SIGMA_M = 0.001
 """Standard deviation of the distance by which the touch itself moves the gear, m."""
@@ -647,9 +648,9 @@ def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
     Two conditions are accepted without all of the data that they require. With the target as the
     only position source, `TARGET_CONTACT` needs no valid position during a press, because the last
     sighting is accurate enough for a while. During a descent, `HANGING` needs no position and
-    accepts telemetry as old as `safety.telemetry_hold_s`. If `HANGING` were not excepted, a vehicle
-    hanging on the magnet would keep its motors running while its telemetry is poor. The end of
-    the weight transfer that follows (`HANGING_WITH_MOTORS_STOPPED`) still needs fresh telemetry.
+    accepts telemetry as old as `safety.telemetry_hold_s`. Without the exception for `HANGING`, a
+    vehicle hanging on the magnet would keep its motors running while its telemetry is poor. The end
+    of the weight transfer that follows (`HANGING_WITH_MOTORS_STOPPED`) still needs fresh telemetry.
     """
     if condition is HANGING and b.command_history.maneuver.descends_to_floor:
         return b.attitude_age_s <= b.profile.safety.telemetry_hold_s

@@ -38,8 +38,8 @@ ZERO_VECTOR: Vector = (0.0, 0.0, 0.0)
 
 MAX_TELEMETRY_GAP_S = 0.2
 """Time without telemetry that counts as a gap, s. In this time a vehicle falls 20 cm, further than
-a vehicle that still hangs can move. Larger: a gap can hide a fall. Smaller: two lost packets count
-as a gap."""
+a vehicle that is still hanging can move. Larger: a gap can hide a fall. Smaller: two lost packets
+count as a gap."""
 MAX_SPEED_NOISE_ACROSS_GAP_MPS = 0.25
 """Largest change in a hanging vehicle's vertical speed that noise of the estimate causes across a
 gap, m/s. Larger: a short fall goes undetected."""
@@ -491,7 +491,7 @@ class ImuMotion(
     body_roll_pitch_rate_radps: tuple[float, float] = (0.0, 0.0)
     # age of the last correction of the state estimate, which this motion does not use
     fusion_age: FusionAge = FusionAge()
-    # time at which the motors went off; inf while they turn
+    # time at which the motors went off; inf while they are turning
     motors_stopped_at_s: float = math.inf
 
     def with_sample(self, last: Telemetry | None, new: Telemetry) -> ImuMotion:
@@ -626,7 +626,7 @@ def _integrate_acceleration(
     """Return the motion with its velocity integrated by the trapezoid rule from `last` to `new`,
     `dt_s` later, and the mean vertical acceleration between the two samples, m/s^2 (world z,
     without gravity). The accelerometer's offsets are learned while the motors are off and the
-    vehicle does not fly."""
+    vehicle is not flying."""
     accelerometer_offset_g = motion.accelerometer_offset_g
     if new.thrust < 1 and not new.has_bit(FLYING):
         accelerometer_offset_g = _filter_accelerometer_offset(

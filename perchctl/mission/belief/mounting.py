@@ -114,7 +114,7 @@ class CameraMountingMonitor:
     @property
     def is_target_motion_undetermined(self) -> bool:
         """True until the vehicle has moved far enough to show whether the target is stationary in
-        the world, as it does if the mounting is right."""
+        the world, as it is if the mounting is right."""
         return not (self.is_camera_mounting_confirmed or self.is_target_stationary)
 
 

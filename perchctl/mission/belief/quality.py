@@ -15,7 +15,7 @@ MAX_LATERAL_SPEED_FROM_DRAUGHT_MPS = 0.5
 late."""
 MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS = 0.15
 """Largest velocity that the estimate may gain without the accelerometer, m/s; correct positions
-cause at most 0.07. Larger: positions in wrong axes displace the vehicle further before they are
+cause at most 0.07. Larger: positions in the wrong axes displace the vehicle further before they are
 noticed."""
 MIN_TARGET_DISTANCE_BELOW_VEHICLE_M = 0.3
 """Distance of the target below the vehicle beyond which it cannot be on the ceiling, m."""
@@ -27,7 +27,8 @@ NO_ESTIMATE_CORRECTION_TEXT = (
 def _does_estimate_contradict_imu(b: Belief) -> bool:
     """True if, with motion capture, the state estimate has recently gained more than
     `MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS` of lateral velocity that the accelerometer has not
-    measured: the positions are then in wrong axes. Always False with another position source."""
+    measured: the positions are then in the wrong axes. Always False with another position
+    source."""
     by_capture = b.profile.positioning.source.is_mocap
     return (
         by_capture
@@ -113,9 +114,9 @@ def hold_reason(b: Belief, maneuver: Maneuver) -> str:
 
 
 def position_loss_text(b: Belief) -> str:
-    """Return a text that says for how long no external position has been sent or, with decks, no
-    measurement has corrected the estimate, and why. While an impact or gust is uncorrected, return
-    a text that says this instead."""
+    """Return a message that says for how long no external position has been sent or, with decks, no
+    measurement has corrected the estimate, and why. While an impact or gust is uncorrected, the
+    message says this instead."""
     if b.is_estimate_missing_gust:
         return "pushed sideways while the target was out of view"
     age_s, why = b.position_correction_age_s, b.obs.external_position_problem
@@ -131,9 +132,9 @@ def position_loss_text(b: Belief) -> str:
 
 
 def excessive_variance_text(b: Belief) -> str:
-    """Return a text that names the variance that is too large, and its limit: the variance of the
-    estimated velocity or, if that is small enough, of the estimated position (with decks, of the
-    height). The text says so if this variance is unknown."""
+    """Return a message that names the variance that is too large, and its limit: the variance of
+    the estimated velocity or, if that is small enough, of the estimated position (with decks, of
+    the height). If this variance is unknown, the message says so."""
     safety = b.profile.safety
     what, variance, unit = "velocity", b.max_axis_velocity_variance_m2ps2, "(m/s)^2"
     most = safety.flight_velocity_variance_m2ps2

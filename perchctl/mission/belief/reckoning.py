@@ -91,7 +91,7 @@ POSITION_SIGMA_TO_DISTANCE_FLOWN_RATIO = 0.3
 """Fraction of the distance flown without a sighting that is added to the standard deviation of a
 dead-reckoned position."""
 VELOCITY_MISSED_BY_IMU_TO_BIAS_GAIN_PER_S = 1.5
-"""Bias of the acceleration, m/s^2, that positions in wrong axes cause per m/s of
+"""Bias of the acceleration, m/s^2, that positions in the wrong axes cause per m/s of
 `lateral_velocity_missed_by_imu_mps`."""
 MAX_HEIGHT_INTEGRATION_STEP_S = 0.5
 """Longest integration step of the dead-reckoned height, s; a longer step is a gap."""
@@ -160,7 +160,7 @@ def advance_dead_reckoning(
       recently.
     - `ignores_lateral_estimate`: adopt only the vertical part of the estimated velocity, because
       the firmware's estimator does not see a lateral push until a position corrects it.
-    - `is_position_diverged`: the estimated velocity may be in wrong axes, so keep the reckoned
+    - `is_position_diverged`: the estimated velocity may be in the wrong axes, so keep the reckoned
       velocity, even after a gap in the telemetry.
     """
     estimated_velocity_mps, impact = sample.velocity_mps, imu.newest_impact
@@ -456,7 +456,7 @@ def restart_velocity_bias_filters(old: DeadReckoning) -> DeadReckoning:
 
 
 def correct_acceleration_bias_for_wrong_positions(old: DeadReckoning) -> DeadReckoning:
-    """Return the dead reckoning with its lateral acceleration bias corrected after positions in
+    """Return the dead reckoning with its lateral acceleration bias corrected after positions in the
     wrong axes. Such positions have given the state estimate a velocity that the accelerometer has
     not measured and, in proportion to it, a wrong tilt, which was learned as a bias. The correction
     is this velocity times `VELOCITY_MISSED_BY_IMU_TO_BIAS_GAIN_PER_S`."""

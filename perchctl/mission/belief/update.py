@@ -451,9 +451,9 @@ def _correct_height_of_supported_vehicle(b: Belief, new: DeadReckoning) -> DeadR
 
 
 def _find_magnet_reach_entry_time_s(b: Belief, new: DeadReckoning) -> float | None:
-    """Return the loop time from which the magnet may have held the vehicle; None if it cannot hold
-    it, because no contact is recorded and either the dead reckoning `new` places the gear outside
-    the magnet's reach or the floor was detected.
+    """Return the loop time from which the magnet may have held the vehicle; None if the magnet
+    cannot hold the vehicle, because no contact is recorded and either the dead reckoning `new`
+    places the gear outside the magnet's reach or the floor was detected.
 
     The time is that of the first tick within reach, or of a later tick within reach after a fall.
     Once the weight transfer or the motor stop has begun, it does not change.
@@ -502,9 +502,9 @@ def _climb_since_last_tick_m(b: Belief, new: DeadReckoning) -> float:
 
 
 def _update_estimators(b: Belief) -> Belief:
-    """Return the belief, with `t_s` and `last_telemetry` of this tick, after the update of its
-    condition start times, hover thrust, rotor thrust, battery fit, mean thrust direction and camera
-    mounting. During a hold, only conditions that persist across phases keep their start times, and
+    """Return the belief with `t_s` and `last_telemetry` of this tick, and with its condition start
+    times, hover thrust, rotor thrust, battery fit, mean thrust direction and camera mounting
+    updated. During a hold, only conditions that persist across phases keep their start times, and
     the mounting is not checked."""
     obs, maneuver = b.obs, b.command_history.maneuver
     held = bool(hold_reason(b, maneuver))
