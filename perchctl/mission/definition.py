@@ -33,7 +33,7 @@ class PhaseDefinition:
             (`VehicleDiagnosis`).
         act: function that returns the new state and the command of each tick.
         exits: the transitions (rows of the table) out of this phase alone, in the order in which
-            they are tried; rows for many phases come before them.
+            they are tried; rows that apply in many phases come before them.
         conditions: the phase's own conditions, whose dwell times its exits use.
     """
 

@@ -9,7 +9,7 @@ table in docs/mission.md):
 
 - by position setpoints, straight down;
 - level, without a position: raw thrust with feedback from the vertical speed;
-- by the firmware's own landing, near the ground or if height, telemetry or loop are unreliable;
+- by the firmware's own landing, near the ground or if height, telemetry or loop is unreliable;
 - peeled off the magnet by a setpoint below the vehicle; if the magnet does not let go, the weight
   is transferred to it.
 
@@ -88,8 +88,8 @@ MAX_HEIGHT_TO_COUNT_AS_LANDED_M = 0.05
 """Height below which a motionless vehicle in a descent by raw thrust counts as being on the floor,
 m."""
 MAX_VERTICAL_SPEED_OF_MOTIONLESS_VEHICLE_MPS = 0.1
-"""Largest vertical speed of a motionless vehicle, m/s. Larger: the motors stop while the vehicle
-still climbs or sinks."""
+"""Largest vertical speed of a motionless vehicle, m/s. Larger: the motors stop while the vehicle is
+still climbing or sinking."""
 ON_FLOOR_DWELL_S = 0.5
 """Time for which a vehicle must be motionless before its motors are stopped, s."""
 
@@ -122,14 +122,14 @@ MAX_ONBOARD_LANDING_EXTENSIONS = 4
 sinks faster than the vehicle can, the vehicle climbs for longer. Smaller: after a longer drift, the
 last trajectory ends in the air."""
 MIN_DEPTH_BELOW_GROUND_TO_EXTEND_LANDING_M = 0.1
-"""Estimated depth below the ground at which a vehicle that still flies shows that the ground is
-lower, m. Larger: a trajectory ends before it is extended. Smaller: the error of a height without
-drift extends the landing."""
+"""Estimated depth below the ground beyond which a vehicle that is still flying shows that the
+ground is lower, m. Larger: a trajectory ends before it is extended. Smaller: the error of a height
+without drift extends the landing."""
 MIN_THRUST_TO_HOVER_RATIO_IF_FLYING = 0.85
-"""Thrust that shows during the firmware's landing that the vehicle still flies, as a fraction of
-the hover thrust. On the floor, above the end of its trajectory, the firmware commands its smallest
-thrust. Larger: a vehicle that sinks faster and faster counts as landed. Smaller: a vehicle that has
-just touched down counts as flying."""
+"""Thrust that shows during the firmware's landing that the vehicle is still flying, as a fraction
+of the hover thrust. Once the vehicle is on the floor, and therefore above the end of its
+trajectory, the firmware commands its smallest thrust. Larger: a vehicle that sinks faster and
+faster counts as landed. Smaller: a vehicle that has just touched down counts as flying."""
 MAX_HEIGHT_DRIFT_IN_LANDING_GOAL_M = 1.0
 """Largest assumed drift of the height, m."""
 MAX_SPECIFIC_FORCE_IN_FALL_G = 0.5
@@ -186,10 +186,10 @@ def enter_descent(state: PlannerState, previous_state: PlannerState) -> PlannerS
     """Return the state at the start of a descent; `previous_state` is the state before the
     transition.
 
-    The setpoint moves to the position of a vehicle that hovers in place, and the hover thrust is
+    If the vehicle is hovering in place, the setpoint moves to its position. The hover thrust is
     estimated for the descent. A landing that the firmware is already executing counts as commanded,
     and motors that are already off count as stopped, so that no command starts them again. After a
-    press, the vehicle counts as within the magnet's reach. With only accelerometer and attitude
+    press, the vehicle counts as within the magnet's reach. If only accelerometer and attitude are
     left, the belief switches to dead reckoning.
     """
     b, tel, old = state.belief, state.belief.telemetry, previous_state.belief
@@ -216,7 +216,7 @@ def enter_descent(state: PlannerState, previous_state: PlannerState) -> PlannerS
         # The vehicle may be within the magnet's reach, even below a sheet that hangs from an unseen
         # ceiling. The vehicle counts as free only after a sighting from below.
         vehicle_world_z_at_last_contact_m = tel.position_m[2]
-    # For a vehicle that hovers in place, the offset that holds it against the wind is kept.
+    # If the vehicle is hovering in place, the offset that holds it against the wind is kept.
     state = move_setpoint_to_vehicle(Context(state))
     within = (
         vehicle_world_z_at_last_contact_m is not None
@@ -273,7 +273,7 @@ def descend(c: Context) -> Action:
       vehicle does not come off, transfer its weight to the magnet.
     - By setpoints: with a position, down to `landing.handover_m`.
     - The firmware's own landing: below `landing.handover_m`, or at once if height, telemetry or
-      loop are unreliable.
+      loop is unreliable.
     """
     b = c.belief
     if not b.can_descend_under_position_control:
@@ -483,9 +483,9 @@ def make_onboard_landing_command(
 
 def _command_onboard_landing(c: Context) -> Action:
     """Send the command for the firmware's own landing until the telemetry shows that the vehicle is
-    executing it, and again if the estimate shows the vehicle below the ground while it still flies:
-    then the estimated height has drifted, or the ground is lower here, and the trajectory would end
-    in the air, where the firmware would stop the motors."""
+    executing it, and again if the estimate shows the vehicle below the ground while it is still
+    flying: in that case, the estimated height has drifted, or the ground is lower here, and the
+    trajectory would end in the air, where the firmware would stop the motors."""
     tel, b = c.telemetry, c.belief
     state, away = end_press(c)
     if (
@@ -529,7 +529,8 @@ def _command_onboard_landing(c: Context) -> Action:
         and c.t_s >= state.descent.onboard_landing_ends_at_s - ONBOARD_LANDING_EXTENSION_LEAD_S
         and extension_count < MAX_ONBOARD_LANDING_EXTENSIONS
     ):
-        # The firmware refuses to land while it is landing; a setpoint ends its trajectory.
+        # While a landing is in progress, the firmware refuses another one; a setpoint ends its
+        # trajectory.
         descent = replace(state.descent, onboard_landing_extension_count=extension_count + 1)
         return replace(
             state, descent=descent, stop_or_land_command_count=0

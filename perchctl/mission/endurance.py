@@ -61,7 +61,7 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
     time_left_s = _time_until_landing_must_begin_s(c, hover_times, predicted.landing_duration_s)
     spare_s = time_left_s - predicted.remaining_attempt_duration_s
     left = c.planner.attempts - c.state.failed_attempts
-    attempts = 0  # also for values that are NaN
+    attempts = 0  # remains 0 if `spare_s` is NaN
     if spare_s >= 0.0:
         attempts = 1 + math.floor(min(spare_s / predicted.retry_duration_s, max(0, left)))
     return BatteryOutlook(
@@ -218,8 +218,8 @@ def is_charge_too_low_for_any_attempt(c: Context) -> bool:
 
 
 def battery_shortfall_text(c: Context) -> str:
-    """Return a text with the time left for attempts and the times that an attempt, the landing and
-    the reserve need."""
+    """Return a message with the time left for attempts and the times that an attempt, the landing
+    and the reserve need."""
     predicted = predict_durations(c)
     has = "the remaining battery time is unknown"
     if c.state.battery.hover_time_left_s is not None:

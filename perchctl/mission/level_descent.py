@@ -46,10 +46,10 @@ SINK_RATE_GAIN_TIMES_MEASUREMENT_AGE_S2_PER_M = 0.06
 """Product of the gain k and the age of the vertical speed, as long as k is between its smallest and
 its largest value."""
 THRUST_FACTOR_IF_CLIMB_RATE_UNKNOWN = 0.98
-"""Factor on the thrust that makes the vehicle descend without a measured vertical speed."""
+"""Factor on the thrust that makes the vehicle descend while its vertical speed is not measured."""
 SINK_RATE_SETPOINT_IF_CAMERA_GUIDED_MPS = 0.4
-"""Sink rate setpoint with pictures, which do not show the distance to the floor, m/s. Larger: the
-vehicle lands harder. Smaller: it drifts for longer."""
+"""Sink rate setpoint if the vertical speed comes from pictures, which do not show the distance to
+the floor, m/s. Larger: the vehicle lands harder. Smaller: it drifts for longer."""
 MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS = 0.2
 """Sink rate measured from pictures below which the vehicle counts as not sinking, m/s; the error of
 single detections is half as large."""
@@ -63,10 +63,10 @@ THRUST_RAMP_DOWN_RATE_HOVER_FRACTION_PER_S = 0.25
 thrust per second. Larger: the vehicle hits the floor faster. Smaller: a magnet holds it for
 longer."""
 CAMERA_GUIDED_RAMP_DOWN_HOVER_FRACTION_PER_S = 0.1
-"""Rate at which the thrust of a vehicle that is not sinking is reduced in a descent by pictures, as
-a fraction of the hover thrust per second; pictures take a quarter of a second to show that the
-vehicle is sinking. Larger: the vehicle falls at first. Smaller: the vehicle is on the floor for
-longer with its motors running."""
+"""Rate at which the thrust of a vehicle that is not sinking is reduced while the vertical speed
+comes from pictures, as a fraction of the hover thrust per second; pictures take a quarter of a
+second to show that the vehicle is sinking. Larger: the vehicle falls at first. Smaller: the vehicle
+is on the floor for longer with its motors running."""
 MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS = 0.05
 """Sink rate, from the telemetry and the commands since its newest sample, below which the vehicle
 counts as not sinking, m/s."""
@@ -77,7 +77,7 @@ MIN_TILT_COSINE_DIVIDING_THRUST = 0.8
 BRAKE_TILT_GAIN_RAD_PER_MPS = 0.25
 """Tilt per lateral speed, rad per m/s."""
 MAX_VISUAL_VELOCITY_AGE_S = 0.5
-"""Largest age of a lateral speed from pictures that the vehicle still brakes, s. Larger: after the
+"""Largest age at which the vehicle still brakes a lateral speed from pictures, s. Larger: after the
 last picture, the vehicle keeps tilting to brake a speed that no longer exists. Smaller: a few lost
 pictures end the braking."""
 MAX_BRAKE_TILT_RAD = 0.22
@@ -114,7 +114,7 @@ TOUCHDOWN_OVERDUE_MARGIN_S = 2.0
 """Time beyond the expected duration of a descent after which the vehicle must have landed or be
 hanging, s."""
 TOUCHDOWN_OVERDUE_MARGIN_IF_CLIMB_UNKNOWN_S = 0.8
-"""Value of `TOUCHDOWN_OVERDUE_MARGIN_S` without a measured vertical speed, s."""
+"""Used instead of `TOUCHDOWN_OVERDUE_MARGIN_S` while the vertical speed is not measured, s."""
 MAX_DURATION_OF_DESCENT_BY_SETPOINTS_S = 1.5
 """Time for which a vehicle with old telemetry and an imprecise hover thrust descends by setpoints,
 using its own estimate, s."""
@@ -125,9 +125,9 @@ MIN_DISTANCE_BELOW_CONTACT_WHEN_DETACHED_M = 0.1
 vehicle that has come off still seems to hang. Smaller: with a drifting estimate, a hanging vehicle
 seems to have come off."""
 MIN_SEEN_GEAR_BELOW_TARGET_IF_DETACHED_M = 0.2
-"""Distance of the gear below the target, from pictures with an old attitude, at which the magnet
-has let go, m. Larger: the vehicle drifts for longer before it brakes. Smaller: a target seen at an
-angle seems to be above."""
+"""Distance of the gear below the target, from pictures with an old attitude, beyond which the
+magnet has let go, m. Larger: the vehicle drifts for longer before it brakes. Smaller: a target seen
+at an angle seems to be above."""
 MAX_THRUST_TO_HOVER_RATIO_IF_SEEN_STANDING = 0.75
 """Fraction of the hover thrust below which a vehicle that does not move in the pictures must be on
 the floor: in the air, it would sink at 1 m/s. Larger: a slow start of the descent looks like the
@@ -206,8 +206,9 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
         climb_mps <= -MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS,
         THRUST_RAMP_DOWN_RATE_HOVER_FRACTION_PER_S,
     )
-    # With pictures, only the measured speed can show that the vehicle is sinking, not the predicted
-    # effect of commands: a vehicle on the floor does not respond to commands.
+    # If the speed comes from pictures, only the measured speed can show that the vehicle is
+    # sinking, not the predicted effect of commands: a vehicle on the floor does not respond to
+    # commands.
     if _visual_motion_if_telemetry_old(c) is not None:
         is_sinking, ramp_per_s = (
             measured_mps <= -MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS,
@@ -289,10 +290,10 @@ def _find_floor_detection_time_s(
 ) -> float | None:
     """Return the time at which the floor was first detected; None if it was not.
 
-    The floor is detected by an impact from below while the vehicle was sinking, at a `height_m`
-    above the ground of less than `MAX_FLOOR_IMPACT_HEIGHT_M`; or by pictures that show no motion,
-    clearly below the target, at a thrust too low compared with `hover_thrust` to support the
-    vehicle. `is_sinking`: the measured speed shows a descent.
+    The floor is detected by an impact from below while the vehicle was sinking and its height above
+    the ground (`height_m`) was less than `MAX_FLOOR_IMPACT_HEIGHT_M`; or by pictures that show no
+    motion, clearly below the target, at a thrust too low compared with `hover_thrust` to support
+    the vehicle. `is_sinking`: the measured speed shows a descent.
     """
     descent, b, seen = c.state.descent, c.belief, _visual_motion_if_telemetry_old(c)
     if descent.floor_detected_at_s is not None:

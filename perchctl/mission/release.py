@@ -29,7 +29,7 @@ MAX_CLIMB_RATE_WHEN_FALLING_AFTER_PRESS_MPS = -0.3
 """Climb rate below which a vehicle that ends its press is falling, m/s; the setpoint then stays at
 the vehicle."""
 INTEGRATOR_UNWIND_SETPOINT_BELOW_VEHICLE_IN_PRESS_M = 1.0
-"""Distance of the setpoint below a vehicle that still presses, m, to unwind the onboard
+"""Distance of the setpoint below a vehicle that is still pressing, m, to unwind the onboard
 integrators. Smaller: unwinding takes seconds."""
 INTEGRATOR_UNWIND_SETPOINT_BELOW_VEHICLE_IN_AIR_M = 0.25
 """Distance of the setpoint below a vehicle that has left the contact, m, to unwind the onboard
@@ -40,8 +40,8 @@ PRESS_END_TIMEOUT_S = 4.0
 # --- release ---
 MAX_PRESS_DURATION_FOR_GRADUAL_RELEASE_S = 1.5
 """Time since the gear stopped, s, after which the setpoint is lowered at once instead of in steps:
-the onboard integrator has wound up and unwinds slowly by itself. Larger: a press whose contact is
-proven late, because the thrust was not reported, lasts longer than 4 s."""
+by then, the onboard integrator has wound up, and it unwinds slowly by itself. Larger: a press whose
+contact is proven late, because the thrust was not reported, lasts longer than 4 s."""
 MIN_RAW_PRESS_TO_HOLDING_THRUST_RATIO = 0.9
 """Fraction of the holding thrust (`complete.hold_ratio` times hover thrust, too little to fly) down
 to which the raw thrust of a press is lowered."""
@@ -60,8 +60,8 @@ STOP_COMMAND_PERIOD_WHILE_THRUST_REPORTED_S = 0.5
 CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M = 1.0
 """Height of the setpoint above a falling vehicle whose motors have stopped, m."""
 CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_ON_M = 0.2
-"""Height of the setpoint above a falling vehicle whose motors run, m: full thrust would carry it to
-the ceiling."""
+"""Height of the setpoint above a falling vehicle whose motors are running, m: full thrust would
+carry it to the ceiling."""
 MIN_THRUST_TO_HOVER_RATIO_IF_MOTORS_ON = 0.5
 """Fraction of hover thrust above which the motors count as running."""
 MIN_FALL_CATCH_DURATION_S = 0.1
@@ -71,7 +71,8 @@ MAX_FALL_CATCH_DURATION_S = 2.0
 MIN_CLIMB_RATE_TO_END_FALL_CATCH_MPS = -0.1
 """Vertical speed above which the catch ends, m/s: the thrust then exceeds the weight."""
 MAX_BRAKED_LATERAL_SPEED_MPS = 1.0
-"""Largest lateral speed that is braked, m/s; no impact that the vehicle survives leaves more."""
+"""Largest lateral speed that is braked, m/s; no impact that the vehicle survives leaves a
+higher one."""
 ONBOARD_POSITION_GAIN_PER_S = 2.0
 """Gains `posCtlPid.xKp` and `yKp` of the firmware, 1/s."""
 
@@ -110,9 +111,9 @@ def reduce_press_before_weight_transfer(c: Context) -> Action:
     magnet.
 
     Lower the setpoint in steps to `complete.release_drop_m` below the contact until the
-    measurements show that the magnet carries the vehicle; at once if the press has lasted longer
-    than `MAX_PRESS_DURATION_FOR_GRADUAL_RELEASE_S`. In a press by raw thrust, lower the thrust to
-    just below the holding thrust instead.
+    measurements show that the magnet carries the vehicle. In a press by raw thrust, lower the
+    thrust to just below the holding thrust instead. If the press has lasted longer than
+    `MAX_PRESS_DURATION_FOR_GRADUAL_RELEASE_S`, take all steps at once.
     """
     complete, perch, state, b = c.planner.complete, c.planner.perch, c.state, c.belief
     step = min(complete.steps, 1 + int(c.time_in_phase_s / complete.release_s * complete.steps))
@@ -172,8 +173,7 @@ def transfer_weight_by_raw_thrust(c: Context, *, max_telemetry_age_s: float = 0.
 def hold_contact_by_position(c: Context) -> Action:
     """Hold by position control while the telemetry is old, to stay in contact or to catch an
     undetected fall. The setpoint is above the recorded contact or, without a contact or a valid
-    position, above the vehicle's last reported height. The weight transfer begins anew
-    afterwards."""
+    position, above the vehicle's last reported height. The weight transfer then starts over."""
     state, tel, b = c.state, c.telemetry, c.belief
     x, y, z_m = tel.position_m
     if b.vehicle_world_z_at_last_contact_m is not None and b.is_position_valid:

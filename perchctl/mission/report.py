@@ -274,8 +274,8 @@ def report_rest(
 def find_touchdown(c: Context) -> Touchdown | None:
     """Return the newest impact from below if it may be the touchdown. Return None if the vehicle is
     perched, if the impact was more than `MAX_TOUCHDOWN_TO_MOTOR_STOP_S` before the motors stopped
-    (or before now, if they still turn), or if a valid position shows that it was too far above the
-    final position.
+    (or before now, if they are still turning), or if a valid position shows that it was too far
+    above the final position.
 
     The downward speed, m/s, comes from dead reckoning if that has replaced the state estimate or if
     positions have diverged; otherwise, it comes from the state estimate.

@@ -41,11 +41,11 @@ def find_rest_state(c: Context) -> RestState:
     """Return the rest state once the motors are off. It is HELD if an object other than the target
     holds the vehicle.
 
-    With a valid position from a deck or motion capture, the vehicle hangs if no target is far
+    With a valid position from a deck or motion capture, the vehicle is hanging if no target is far
     above, and it either has hardly come down since the phase began high above the ground or has a
-    recorded contact and is too high to rest on the floor; otherwise, it stands. Without such a
-    position, it stands if a tracked target is far above; otherwise, the falls measured since it
-    came within the magnet's reach decide (`_find_rest_state_from_falls`).
+    recorded contact and is too high to rest on the floor; otherwise, it is on the floor. Without
+    such a position, it is on the floor if a tracked target is far above; otherwise, the falls
+    measured since it came within the magnet's reach decide (`_find_rest_state_from_falls`).
     """
     b, state = c.belief, c.state
     if _is_held_by_other_object(c):
@@ -93,7 +93,7 @@ def _is_held_by_other_object(c: Context) -> bool:
 def _find_rest_state_from_falls(c: Context) -> RestState:
     """Return the rest state from the falls that the accelerometer has measured since the vehicle
     came within the magnet's reach. The state is UNKNOWN after a gap in the telemetry that was long
-    enough to hide a fall or an attachment to the magnet."""
+    enough for the vehicle to fall, or to be caught by the magnet, unnoticed."""
     b, dead_reckoning, since_s = (
         c.belief,
         c.belief.dead_reckoning,

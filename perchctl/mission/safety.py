@@ -63,7 +63,7 @@ MAX_LATERAL_MOTION_BEFORE_LIFTOFF_M = 0.12
 """Largest lateral motion of the vehicle before it has lifted off, m. Larger: a wrong mounting tips
 it over."""
 MAX_HEIGHT_FOR_TIGHTER_DEVIATION_LIMIT_M = 0.3
-"""Height below which positions in wrong axes may lead the vehicle into the floor, m."""
+"""Height below which positions in the wrong axes may lead the vehicle into the floor, m."""
 MAX_LATERAL_DISTANCE_FROM_SETPOINT_IF_LOW_M = 0.22
 """Lateral distance from the setpoint at which positions have diverged, m, below
 `MAX_HEIGHT_FOR_TIGHTER_DEVIATION_LIMIT_M` and in a vertical climb."""
@@ -90,8 +90,8 @@ difference is 0.1. Larger: the vehicle strikes the target. Smaller: a gust ends 
 TARGET_BELOW_VEHICLE_DWELL_S = 0.3
 """Time for which the target must appear below the vehicle, s."""
 SLOW_HOVER_DWELL_S = 2.0
-"""Time at nearly full thrust after which a vehicle that hovers has too little thrust, s. Larger: it
-sinks to the floor from a greater height. Smaller: a gust makes a weak vehicle land."""
+"""Time at nearly full thrust after which a hovering vehicle counts as having too little thrust, s.
+Larger: it sinks to the floor from a greater height. Smaller: a gust makes a weak vehicle land."""
 NOT_CLIMBING_DWELL_S = 2.0
 """Time at full thrust after which a vehicle that does not climb has too little thrust for a press,
 or is pressing against something, s. Larger: it presses for longer. Smaller: a gust makes a weak
@@ -103,7 +103,8 @@ from a greater height. Smaller: a weak vehicle that can perch lands."""
 HELD_BY_OTHER_OBJECT_DWELL_S = 2.0
 """Time that it takes to distinguish the magnet from other supports, s."""
 MAX_VELOCITY_VARIANCE_WITHOUT_SIGHTING_M2PS2 = 0.02
-"""Variance of the velocity about 3 s after the last sighting, (m/s)^2."""
+"""Variance of the estimated velocity above which a stale position counts as lost, (m/s)^2; it is
+reached about 3 s after the last sighting."""
 MIN_SIGHTING_TO_WRONG_ESTIMATE_DISTANCE_M = 0.3
 """Distance of the newest sighting from the estimate beyond which the estimate is wrong, m. Larger:
 position control moves the vehicle further away. Smaller: an oscillation ends the flight."""
@@ -118,7 +119,7 @@ ends the flight."""
 
 def is_position_control_diverging(c: Context) -> bool:
     """True if position control leads the vehicle away from its setpoint, as with external positions
-    in wrong axes: it is further away than any draught could move it, it oscillates, or its
+    in the wrong axes: it is further away than any draught could move it, it oscillates, or its
     estimated velocity contradicts the accelerometer. Always False with a deck or without a valid
     position."""
     setpoint, phase, b = c.state.setpoint, c.state.phase, c.belief
@@ -180,8 +181,8 @@ def _lateral_distance_from_setpoint_m(c: Context) -> float:
 
 
 def divergence_reason(c: Context) -> str:
-    """Return a text that says which evidence shows that the positions are wrong, and the possible
-    causes."""
+    """Return a message that says which evidence shows that the positions are wrong, and the
+    possible causes."""
     b = c.belief
     if _is_oscillating_vertically(c):
         return (
@@ -240,7 +241,7 @@ def is_outside_fleet_corridor(c: Context) -> bool:
 
 
 def wrong_camera_latency_reason(c: Context) -> str:
-    """Return a text with the measured age of the pictures and the age that was expected."""
+    """Return a message with the measured age of the pictures and the age that was expected."""
     camera, b = c.profile.camera, c.belief
     assumed_s = camera.start_latency_s + c.obs.camera_latency_above_profile_s
     error_s = b.camera_imu_mismatch.camera_latency_error_s
@@ -276,7 +277,7 @@ def is_camera_mounting_contradicted(c: Context) -> bool:
 
 
 def wrong_camera_mounting_reason(c: Context) -> str:
-    """Return a text that says how the camera seems to be mounted, and what to do."""
+    """Return a message that says how the camera seems to be mounted, and what to do."""
     b = c.belief
     turn_rad = b.camera_imu_mismatch.camera_yaw_error_rad
     if turn_rad or b.mounting.is_camera_mounting_wrong:
@@ -300,8 +301,8 @@ def wrong_camera_mounting_reason(c: Context) -> str:
 
 def is_held_by_target(c: Context) -> bool:
     """True if thrust, position and motion have shown for `HANGING_CONFIRMATION_DWELL_S` that
-    something is holding the vehicle, and if this support is the target's magnet, although no press
-    has proven a contact."""
+    something is holding the vehicle, and if this support is the target's magnet, even though no
+    press has proven a contact."""
     hangs = c.true_for_s(HANGING) >= HANGING_CONFIRMATION_DWELL_S
     return hangs and c.support is Support.MAGNET
 
@@ -336,11 +337,12 @@ def is_thrust_insufficient_for_takeoff(c: Context) -> bool:
 
 
 def is_thrust_insufficient(c: Context) -> bool:
-    """True if no thrust remains to fly on or to press, measured or predicted. Measured: the vehicle
-    has not climbed at full thrust for `NOT_CLIMBING_DWELL_S`, or has hardly climbed at nearly full
-    thrust for `SLOW_HOVER_DWELL_S`. In an ascent, only the first counts, since a weak vehicle that
-    can perch climbs the last part slowly. Predicted, at the stand-off before the press: hover
-    thrust exceeds `MIN_SATURATED_TO_FULL_THRUST_RATIO` times the largest press thrust.
+    """True if too little thrust remains to keep flying or to press, as measured or as predicted.
+    Measured: the vehicle has not climbed at full thrust for `NOT_CLIMBING_DWELL_S`, or has hardly
+    climbed at nearly full thrust for `SLOW_HOVER_DWELL_S`. In an ascent, only the first counts,
+    since a weak vehicle that can perch climbs the last part slowly. Predicted, at the stand-off
+    before the press: hover thrust exceeds `MIN_SATURATED_TO_FULL_THRUST_RATIO` times the largest
+    press thrust.
 
     A mission that hovers does not press, so nothing is predicted for it. False while a press is
     being ended.

@@ -192,10 +192,11 @@ def update_lateral_integral(
 
 
 def move_setpoint_to_vehicle(c: Context) -> PlannerState:
-    """Return the state with its setpoint moved to the vehicle's position, if it hovers in place.
-    The integral absorbs the difference, so that the command that is sent does not jump.
+    """Return the state with its setpoint moved to the vehicle's position, if the vehicle is
+    hovering in place. The integral absorbs the difference, so that the command that is sent does
+    not jump.
 
-    A vehicle that moves keeps its setpoint and integral. Without a setpoint, or with diverged
+    A moving vehicle keeps its setpoint and integral. Without a setpoint, or with diverged
     positions, the integral becomes zero.
     """
     reference, (x_m, y_m, _) = c.state.setpoint, c.telemetry.position_m

@@ -33,10 +33,10 @@ class BatteryOutlook:
 class DescentState:
     """State of a descent.
 
-    By raw thrust: the last commanded thrust, 0..65535 (0 before the descent), the change of the
-    climb rate, positive up, that recent commands cause but no sample shows yet, when the floor was
-    detected (None before), and when a setpoint last gave the firmware a new heading. By the
-    firmware's own landing: when its trajectory ends, and how often it was extended.
+    For a descent by raw thrust: the last commanded thrust, 0..65535 (0 before the descent), the
+    change of the climb rate, positive up, that recent commands cause but no sample shows yet, when
+    the floor was detected (None before), and when a setpoint last gave the firmware a new heading.
+    For the firmware's own landing: when its trajectory ends, and how often it was extended.
     """
 
     last_commanded_raw_thrust: float = 0.0

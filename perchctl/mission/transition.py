@@ -18,7 +18,7 @@ OutcomeAfterTransition = Outcome | Callable[[Outcome | None], Outcome | None]
 class Transition:
     """A row of the table: from any of `phases` to the phase `to` if `when` returns True.
 
-    `when` is called with a `Context`. `reason`, a text or a function of the context, is shown to
+    `when` is called with a `Context`. `reason`, a string or a function of the context, is shown to
     the user. `outcome`, a value or a function of the previous outcome, is the reason why the flight
     ends. `stop_command` is the command that a transition into ABORTED sends at once. `diagnosis` is
     what the row asserts about the vehicle.

@@ -90,7 +90,7 @@ def is_hover_height_unsafe(c: Context) -> bool:
 
 
 def unsafe_hover_reason(c: Context) -> str:
-    """Return a text with the height at which the vehicle would hover and the range of allowed
+    """Return a message with the height at which the vehicle would hover and the range of allowed
     heights."""
     hover, height_m = c.planner.hover, planned_hover_height_m(c)
     assert hover is not None

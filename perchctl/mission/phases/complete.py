@@ -26,7 +26,7 @@ from perchctl.mission.transition import Transition, back_off_row, land_row
 from perchctl.values import replace
 
 MOTOR_STOP_TIMEOUT_AFTER_HANG_MONITORING_S = 10.0
-"""Time after the end of the monitoring at which the flight ends although telemetry still shows
+"""Time after the end of the monitoring at which the flight ends even if telemetry still shows
 thrust, s."""
 
 

@@ -102,7 +102,7 @@ def has_left_hover_position(c: Context) -> bool:
 
 
 def left_hover_position_reason(c: Context) -> str:
-    """Return a text that says how far the vehicle is from its hover position."""
+    """Return a message that says how far the vehicle is from its hover position."""
     aside_m, below_m = (
         c.belief.target.gear_to_target_distance_xy_m,
         distance_below_hover_height_m(c),

@@ -125,8 +125,8 @@ def act_in_recover(c: Context) -> Action:
         return caught
     recover = c.planner.recover
     least_m = min(MIN_DISTANCE_BELOW_CONTACT_TO_RECOVER_M, 0.5 * recover.descend_m)
-    # Over a contact of some seconds, the estimate may drift downwards by as much. In this phase,
-    # the vehicle itself must have descended.
+    # During a contact that lasts several seconds, the estimate may drift downwards by this much. In
+    # this phase, the vehicle itself must have descended.
     if c.state.entry.position_m[2] - c.telemetry.position_m[2] >= least_m:
         c = Context(forget_contact_when_below(c.state, least_m))
     state, away = end_press(c)
@@ -163,8 +163,8 @@ def has_recovered(c: Context) -> bool:
 
 
 def unsteady_reason(c: Context) -> str:
-    """Return a text that lists the measurements by which the vehicle was judged unsteady. The text
-    gives no causes."""
+    """Return a message that lists the measurements by which the vehicle was judged unsteady. The
+    message gives no causes."""
     b, setpoint = c.belief, c.state.setpoint
     seen = [f"moving at {b.speed_mps:.2f} m/s"] if math.isfinite(b.speed_mps) else []
     if b.is_position_valid and setpoint is not None:

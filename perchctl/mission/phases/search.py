@@ -92,7 +92,7 @@ def _limit_move_before_camera_mounting_check(
 
 
 def target_not_found_reason(c: Context) -> str:
-    """Return a text that says that the target was not found, and why if known."""
+    """Return a message that says that the target was not found, and why if known."""
     text, why = "target not found in the allowed attempts", c.obs.camera_problem
     why = why or c.obs.target_refusal_reason
     return f"{text}: {why}" if why else text
