@@ -91,8 +91,8 @@ def smallest_side_px(
         # Three adjacent sizes are averaged, because the rate rises slowly between 0.8 and 1.
         return (rate(i - 1) + rate(i) + rate(i + 1)) / 3.0 >= FOUND_RATE
 
-    # Starting with the largest sides would be slow because the images are large, so the side is
-    # doubled first and then bisected.
+    # Starting with the largest sides would be slow because the images are large, so the search
+    # starts with the smallest side, takes growing steps, and then bisects.
     low, high, stride = -1, 0, 4
     while not found(high):
         low = high

@@ -36,7 +36,8 @@ NEEDED = (
 HEADER = ",".join(NEEDED)
 
 MOST_APART = np.array([0.3, 0.3, 0.3, np.radians(30.0)])
-"""Difference from the ground truth above which a marker's pose is probably in other units, m."""
+"""Difference from the ground truth in x, y, z (m) and yaw (rad) above which a marker's pose is
+probably in different units."""
 
 
 @dataclass(frozen=True, eq=False)
