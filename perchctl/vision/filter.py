@@ -33,8 +33,8 @@ TILTS, PRINT = slice(0, 2), slice(2, 4)
 MAX_TRACK_GAP_S = 1.0
 """Longest gap between two frames of a track, s; a longer gap ends the track."""
 MAX_PREDICTION_DURATION_S = 1.0
-"""Longest prediction, s; for a later time, the target is assumed to stay where it was predicted
-after this time."""
+"""Longest prediction, s; after that, the target is assumed to stay where it was predicted to be at
+this limit."""
 
 _IDENTITY_3: Array = np.eye(3)
 _IDENTITY_8: Array = np.eye(8)
@@ -55,7 +55,7 @@ _WORLD_FRAME_YAW_XYZ_DRIFT_COV_PER_S = np.diag([math.radians(0.1), 0.005, 0.005,
 second."""
 _WORLD_FRAME_HEADING_ACCELERATION_SIGMA_RADPS2 = 0.1
 _MAX_NIS_WITHOUT_RESTART = 25.0
-"""Limit of the normalized innovation squared (NIS) with four degrees of freedom; by chance, 5 of
+"""Limit of the normalized innovation squared (NIS) with four degrees of freedom; by chance, 5 in
 100 000 updates exceed it. Larger: after a lost frame, the track of a camera without a vehicle
 learns a wrong velocity. Smaller: noise restarts the track."""
 

@@ -89,7 +89,7 @@ def update_tracks(
     to `t_s`.
 
     If the gate restarts the tracks, or if they change between the world frame (`is_in_world_frame`)
-    and the level frame, they begin anew. A pose that does not continue a track is also rejected if
+    and the level frame, they start over. A pose that does not continue a track is also rejected if
     it shows another vehicle's target. If the gate is disabled, there is no lock and no rival.
     """
     filter_setup = setup.select_filter(is_in_world_frame)
@@ -159,8 +159,8 @@ def update_tracks(
 # are equally far away and the target was not seen for `REACQUIRE_S` although its position is in the
 # image. If the lock has only a few frames, it changes to any rival that was seen more often.
 #
-# If the camera is not on a vehicle, neither its motion nor the number of frames that a recording
-# lacks is known, so a rival is most likely the target from a different viewpoint. The lock then
+# If the camera is not on a vehicle, neither its motion nor the number of frames missing from a
+# recording is known, so a rival is most likely the target from a different viewpoint. The lock then
 # changes when only the rival has been seen for `MIN_RIVAL_ALONE_IN_VIEW_DURATION_S`, if the rival
 # shows both markers or if the locked target never did. A rival that was seen before the target was
 # lost is a second target, and the lock only changes to it after `REACQUIRE_S`.
@@ -181,8 +181,8 @@ REACQUIRE_S, REACQUIRE_FRAMES = 3.0, 30
 another target captures the lock."""
 MIN_RIVAL_ALONE_IN_VIEW_DURATION_S = 0.3
 """Time, s, for which a camera without a vehicle must see only the rival before the lock changes to
-it. Larger: after lost frames, a recording is without a target for longer. Smaller: fewer successive
-wrong frames are enough to capture the lock."""
+it. Larger: after lost frames, a recording has no target for longer. Smaller: fewer successive wrong
+frames are enough to capture the lock."""
 LOCK_TIMEOUT_S = 10.0
 """Time after which a lock in the world frame expires if the target is not seen, s."""
 MIN_ESTABLISHED_LOCK_FRAMES = 5
@@ -192,7 +192,7 @@ _ESTIMATE_JUMPED_TEXT = "the state estimate jumped, but the target did not"
 _PREVIOUS_POSE_WRONG_TEXT = (
     "the target is where it was expected before the previous pose, which may have been wrong"
 )
-# With four dimensions, 5 of 100 000 squared distances exceed it by chance.
+# With four dimensions, 5 in 100 000 squared distances exceed it by chance.
 _MAX_ACCEPTED_INNOVATION_CHI2 = 25.0
 _MAX_RANGE_DIFFERENCE_SIGMAS = 4.0
 # Errors that no covariance includes (calibration, print, latency): constants and fractions of the
@@ -355,9 +355,9 @@ def update_lock(
     """Return the updated lock after the gate has accepted `frame_pose`. `track` is the track that
     this pose has updated.
 
-    If `lock` is None, a new lock begins. The count of accepted frames and the previous track are
-    kept, unless the track has restarted at a rival or the frame (level or world) of the tracks has
-    changed; then the lock begins anew.
+    If `lock` is None, a new lock is created. The count of accepted frames and the previous track
+    are kept, unless the track has restarted at a rival or the frame (level or world) of the tracks
+    has changed; in that case the lock starts over.
     """
     anew = verdict.restarts_track and not verdict.restarts_at_locked_target
     before = (

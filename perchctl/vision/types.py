@@ -65,9 +65,9 @@ class CameraModel:
 
 
 MAX_CAMERA_MATRIX_SKEW_PX = 0.3
-"""Largest skew of a camera matrix, px. A skew of s px moves an image point laterally by s y/z. With
-this skew, a point at the lower edge of the example camera's image moves by 0.2 px, or 0.5 mm at 1
-m. Larger: an error that no other check detects is accepted."""
+"""Largest skew allowed in a camera matrix, px. A skew of s px moves an image point laterally by s
+y/z. With this skew, a point at the lower edge of the example camera's image moves by 0.2 px, or 0.5
+mm at 1 m. Larger: an error that no other check detects is accepted."""
 
 
 def check_camera_matrix(K: Array) -> None:
@@ -80,8 +80,8 @@ def check_camera_matrix(K: Array) -> None:
         if abs(K[0, 1]) > MAX_CAMERA_MATRIX_SKEW_PX:
             raise InvalidValue(
                 f"the camera matrix has a skew of {K[0, 1]:g} px (row 1, column 2), but at most "
-                f"{MAX_CAMERA_MATRIX_SKEW_PX:g} px is allowed: calibrate without skew (OpenCV's "
-                f"CALIB_FIX_SKEW, --fisheye-fix-skew of ROS)"
+                f"{MAX_CAMERA_MATRIX_SKEW_PX:g} px is allowed: calibrate without skew "
+                f"(CALIB_FIX_SKEW in OpenCV, --fisheye-fix-skew in ROS)"
             )
         return
     if (K[:2, 2] == 0.0).all() and K[0, 1] == 0.0 and K[2, 2] == 1.0:
@@ -379,9 +379,10 @@ class LastPose:
 
 @dataclass(frozen=True, eq=False)
 class TargetLock:
-    """The target that the pipeline is locked on: its last track and pose, the number of frames with
-    an accepted pose (`accepted_frame_count`), and whether any of these poses used both markers.
-    `track_before_last_pose` is the track without its last pose; None after the first pose."""
+    """The target that the pipeline is locked onto: its last track and pose, the number of frames
+    with an accepted pose (`accepted_frame_count`), and whether any of these poses used both
+    markers. `track_before_last_pose` is the track without its last pose; None after the first
+    pose."""
 
     track: MarkerTrack
     pose: MarkerPose

@@ -675,7 +675,7 @@ _CONVERGED_FIT_PX, _MAX_CONVERGENCE_ERROR_PX = 0.02, 0.5
 _MIN_EDGE_CONTRAST, _MIN_CONTRAST_FRACTION = 8.0, 0.35
 _MIN_EDGE_POINTS = 24
 _TUKEY_CUTOFF_SIGMAS, _MIN_TUKEY_SCALE_PX = 3.5, 0.15
-# Robust weights make the squared residuals smaller; this factor compensates for it.
+# Robust weights make the squared residuals smaller; this factor compensates for that.
 _ROBUST_VARIANCE_FACTOR = 1.3
 # Error of a whole line, due to the lens and the illumination.
 _COMMON_LINE_OFFSET_SIGMA_PX = 0.02
@@ -742,7 +742,7 @@ class PoseFit:
 
 @dataclass(frozen=True, eq=False)
 class _EdgePoints:
-    """Those edge points of a target outline that are in the image.
+    """The edge points of a target outline that are in the image.
 
     Attributes:
         points_px, image_normal_to_white: points (n, 2) px in the distorted image, and unit normals

@@ -439,7 +439,7 @@ def make_detection_prior(
     frame_counter_for_initial_blur = None
     if frames_without_markers is not None and search_mode in ("near_expected", "expected_fits"):
         frame_counter_for_initial_blur = (frames_without_markers + 2) // 4
-    # A part of the target is only recognized at a position that was measured a short time ago.
+    # A part of the target is only recognised at a recently measured position.
     last = {} if previous is None else {d.marker: d.corners_px for d in previous.markers}
     was_recent = (
         previous is not None
@@ -495,7 +495,7 @@ def _choose_search_mode(
     is near the expected corners. Otherwise, to save time, the kinds of search alternate from frame
     to frame. If no target is expected, or if `is_line_fit_enabled` is False, the whole image is
     searched; in the latter case, only for sharp markers. If `frames_without_markers` is None, all
-    kinds are selected in any case."""
+    kinds are selected regardless of the other arguments."""
     if frames_without_markers is None:
         return "all"
     if not is_line_fit_enabled or (is_target_expected and frames_without_markers % 2):
@@ -654,8 +654,8 @@ _OTHER_MARKER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large
 
 
 def is_line_fit_sufficient(corners: RefinedCorners, pattern: MarkerPattern) -> bool:
-    """True if the corners come from an edge fit that is as accurate as a photometric fit. For this,
-    a cell must be at least 6 px wide, and at least 6 times as wide as the blur."""
+    """True if the corners come from an edge fit that is as accurate as a photometric fit. This
+    requires cells that are at least 6 px wide, and at least 6 times as wide as the blur."""
     cell_size_px = mean_side_px(corners.corners_px) / pattern.cells_along_border.cells_per_side
     return corners.are_corners_fitted and cell_size_px >= max(
         _MIN_CELL_FOR_ACCURATE_LINE_FIT_PX,
@@ -763,8 +763,8 @@ def fit_lines(
     cells.
 
     All markers are fitted together, because blooming and gamma move all edges of an image by the
-    same number of pixels. `known_edge_shift` is how far white has grown over black, if this was
-    measured before; None measures it.
+    same number of pixels. `known_edge_shift` is how far white has grown over black; if it is None,
+    the growth is measured.
     """
     if not start_corners_px:
         return {}
@@ -790,7 +790,7 @@ def refine_expected_markers(
 
     A marker is omitted if it is more than 0.85 cells (at most 7 px) from its expected position, if
     it is truncated or hidden, or if its cells are smaller than 2.5 px. `known_edge_shift` is how
-    far white has grown over black; None measures it.
+    far white has grown over black; if it is None, the growth is measured.
     """
     image, patterns = detector_input.image, detector_input.setup.patterns
     start_corners_px = {
@@ -820,7 +820,7 @@ def add_partly_visible_markers(
 
     If the small marker was found, the large one is expected around it. If only the large marker is
     found, the small one is derived from it and added if the image resembles it. `known_edge_shift`
-    is how far white has grown over black at all edges; None measures it.
+    is how far white has grown over black at all edges; if it is None, the growth is measured.
     """
     start_corners_px, found_corners = dict(expected_corners_px), dict(found_corners)
     if "small" in found_corners and "large" not in found_corners:

@@ -25,7 +25,7 @@ The result is wrong if the white of only some sides is clipped, if a cell is onl
 as wide as the blur and its neighbours bend the sides, or if the sheet is curled. The standard
 deviation of the corners allows for partial clipping and for narrow cells. `refine_corners_by_lines`
 returns None for a marker if a corner moved by more than 0.6 cells (and by more than 1.6 px), if the
-edge points deviate from their line by 0.6 px, if less than half of the profiles are inliers, or if
+edge points deviate from their line by 0.6 px, if fewer than half of the profiles are inliers, or if
 the blur fills the window.
 
 Lengths are in image pixels; lines and points are in normalised image coordinates.

@@ -10,9 +10,9 @@ edges in the image:
     min sum w_k (r_k - a_k.P - s_k d)^2 + (d - d_0)^2 / sigma_d^2,    H <- H (I + P)
 
 where a_k is the derivative of edge k with respect to P, s_k is -1 for sides and +1 for inner edges,
-and d_0 is the shift measured before. The position of the invisible part follows from the visible
-part. Its accuracy is given by the covariance of the corners (8, 8) px^2, which is J N^-1 J' times
-the variance of an edge.
+and d_0 is the previously measured shift (0 if there is none). The position of the invisible part
+follows from the visible part. Its accuracy is given by the covariance of the corners (8, 8) px^2,
+which is J N^-1 J' times the variance of an edge.
 
 The result is wrong if the boundary of glare or of a shadow runs along a side and is mistaken for
 it. The result is None if the standard deviation of a corner is above 2 % of the side, or if the
@@ -75,7 +75,7 @@ _MAX_EDGE_FIT_RMS_RESIDUAL_PX = 0.6
 _MAX_BLUR_TO_WINDOW_HALF_LENGTH_RATIO = 0.9
 _MAX_CORNER_SIGMA_SIDES = 0.02  # Corners with a larger standard deviation are rejected.
 _MIN_EDGE_SHIFT_SIGMA_PX = 0.01
-# Robust weights make the squared residuals smaller; this factor compensates for it.
+# Robust weights make the squared residuals smaller; this factor compensates for that.
 _ROBUST_VARIANCE_FACTOR = 1.3
 _MAX_HOMOGRAPHY_INCREMENT = 0.5
 # Three times the reach of a search window; the edges cannot move a fit further from its start.
@@ -94,9 +94,9 @@ def fit_partly_visible_marker(
 
     `identified_by` is the evidence for the marker's identity: its own cells alone ("bits"), the
     predicted position ("track") or the other marker ("other_marker"). This evidence determines how
-    many visible cells must match. `known_edge_shift` is how far white has grown over black, if this
-    was measured before. Returns None if the visible part does not determine the corners, or if its
-    cells do not match the marker.
+    many visible cells must match. `known_edge_shift` is how far white has grown over black, or None
+    if it has not been measured. Returns None if the visible part does not determine the corners, or
+    if its cells do not match the marker.
     """
     pattern, camera = detector_input.setup.patterns[name], detector_input.camera
     if (
@@ -268,8 +268,8 @@ def _make_refined_corners(
 IdentificationEvidence = Literal["bits", "track", "other_marker"]
 """What identifies a marker: its cells alone, its previous position, or the other marker."""
 _MIN_KNOWN_CELL_FRACTION = 0.6
-# A sample glares if it is brighter than white by more than this fraction of the contrast, or if it
-# is at least as bright as this grey level although white is not.
+# A sample counts as glare if it is brighter than white by more than this fraction of the contrast,
+# or if it is at least as bright as this grey level although white is not.
 _GLARE, _BRIGHTEST_GREY = 0.25, 250.0
 # Other codewords differ from the marker's in two bits.
 _MAX_INVISIBLE_BITS: dict[IdentificationEvidence, int] = {"bits": 1, "track": 4}

@@ -580,8 +580,9 @@ OFFSET, OFFSET_U, OFFSET_V, GAIN, GAIN_U, GAIN_V, BEND, BEYOND = range(8)
 @dataclass(frozen=True, eq=False)
 class RenderedDrawing:
     """A marker's drawing at the nodes of `grid`, which lies in the marker's plane: its whiteness (0
-    black, 1 white) and how far it is off the paper, not yet the greys of an image. Both are blurred
-    by a Gaussian with the standard deviation `blur_sigma_nodes`, in node spacings."""
+    black, 1 white) and the fraction of each node that is beyond the paper, before the illumination
+    turns them into grey values. Both are blurred by a Gaussian with the standard deviation
+    `blur_sigma_nodes`, in node spacings."""
 
     drawing: MarkerDrawing
     grid: SamplingGrid
