@@ -64,8 +64,8 @@ def _parsed(path: Path) -> tuple[CameraModel, dict[str, Any]]:
         lens, values = parse_calibration(text)
         return _checked(lens), values
     except InvalidValue as error:
-        # In a file that may be a calibration, the faulty key is what the user needs; in any other
-        # file, its kind is.
+        # If the file may be a calibration, tell the user which key is faulty; otherwise, what kind
+        # of file it is.
         if note := kind_note(path, "a camera calibration", "a JSON file"):
             raise InvalidValue(f"{path} is not a camera calibration{note}") from None
         raise InvalidValue(f"{path}: {error}") from None

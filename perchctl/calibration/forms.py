@@ -348,8 +348,8 @@ def _is_note(key: str) -> bool:
 
 
 def _by_meaning(values: Mapping[str, Any], form: Form, needed: tuple[str, ...]) -> _Found:
-    """The values of the keys that are read. Raises InvalidValue for a key that is missing, that has
-    no neutral value although it must, or that is in no table."""
+    """The values of the keys that are read. Raises InvalidValue for a key that is missing, that
+    must have a neutral value but does not, or that is not in any table."""
     meanings = {_plain_key(k): meaning for meaning, keys in form.read.items() for k in keys}
     neutral = {_plain_key(k): allowed for k, allowed in form.neutral.items()}
     notes = {_plain_key(k) for k in form.notes}

@@ -183,7 +183,7 @@ LEAST_RANGE_M = 0.15
 """Minimum range of the target, m; at closer range, the line of sight hardly moves and the press
 follows soon."""
 STAMPS_S = 0.003
-"""Errors of the time stamps of telemetry and exposure that averaging does not reduce, s."""
+"""Errors in the time stamps of telemetry and exposures that averaging does not reduce, s."""
 LARGE_TURN = 0.03
 """Relative error of the estimate if the rotation is large, because the speeds assume the profile's
 mounting."""

@@ -260,9 +260,9 @@ class MotionCapture:
 
 
 # --- The child process that runs the motion-capture library ---
-# Some systems of the library wait in `connect` forever without letting any other thread of their
-# process run, and some end the process without a message (docs/positioning.md). In a child process,
-# neither of these failures stops the flight.
+# With some systems, the library waits in `connect` forever without letting any other thread of its
+# process run; with others, it ends the process without a message (docs/positioning.md). In a child
+# process, neither of these failures stops the flight.
 
 
 START_TIMEOUT_S = 30.0
@@ -307,9 +307,9 @@ def serve_parent() -> None:
 def _pass_on(client: Any, channel: Channel, partial: bool) -> None:
     """Pass frames on to the parent as they arrive, but never a frame of unknown age.
 
-    After a pause, the library may return frames that waited in its queue. The first frame, and each
-    further one that arrives without any waiting, is therefore not sent, and the parent receives the
-    reason.
+    After a pause, the library may return frames that waited in its queue. The first frame after the
+    pause, and each one that follows without a wait, is therefore not sent, and the parent receives
+    the reason.
     """
     sent_s, behind = -1.0, False
     # time of the first and the newest frame since the last pause, and their number

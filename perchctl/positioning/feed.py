@@ -70,9 +70,9 @@ FEED_HANG_S = 0.2
 """Time without a poll after which the feed counts as blocked, s. Polls come every 10 ms, or once
 per tick in a simulated flight."""
 RATE_OVER_S = 1.0
-"""Time over which the rate of sent positions is counted, s."""
+"""Time over which the rate of sent positions is computed, s."""
 END_TIMEOUT_S = 1.0
-"""Longest wait for the end of the thread, s."""
+"""Longest wait for the thread to end, s."""
 UNSEEN = "the target is not seen"
 STOPPED = "the positions contradict the accelerometer and are no longer sent"
 BUSY = "the link is busy, and positions are not queued"
@@ -273,7 +273,7 @@ FASTEST_FALL_MPS = 5.0
 Smaller: the positions of a falling vehicle are rejected."""
 FASTEST_TIP_RADPS = 10.0
 """Largest plausible rotation rate just after an accepted pose, rad/s: the rate of a vehicle that is
-tipped over."""
+tipping over."""
 AT_FASTEST_S = 0.02
 """Time after an accepted pose from which `HELD_MPS` and `HELD_RADPS` apply instead, s. Larger: a
 pose that jumped is accepted."""

@@ -35,9 +35,9 @@ GROUND_FRAMES = 15
 """Number of frames at rest whose median gives the target's position: half a second with a 30 Hz
 camera."""
 SETTLED_TILT_RAD = 0.003
-"""Largest difference between the attitudes of these frames, rad: 6 mm at 2 m. Larger: a target that
-is seen while the estimator still corrects its attitude is learned in the wrong place. Smaller: the
-noise of the attitude delays a take-off."""
+"""Largest difference between the attitudes of these frames, rad: 6 mm at 2 m. Larger: if the target
+is seen while the estimator is still correcting its attitude, the learned position of the target is
+wrong. Smaller: noise in the attitude delays a take-off."""
 SETTLED_POSITION_M = 0.02
 """Largest difference between the estimated positions of these frames, m."""
 OLDEST_S = 0.3
@@ -47,7 +47,7 @@ GATE_M, GATE_MPS, GATE_SIGMAS = 0.10, 0.35, 5.0
 m/s: after 2 s without one, a vehicle is displaced by half a metre (docs/firmware.md, "Target as
 position")."""
 GATE_LONGEST_S = 4.0
-"""Longest time without a sighting for which the gate grows, s."""
+"""Time without a sighting after which the gate stops growing, s."""
 WORST_SIGMA_M = 0.05
 """Largest standard deviation of a pose that is sent, m."""
 LEARN_NEAR_M = 0.3
@@ -60,7 +60,8 @@ LEARN_NEAR_S = 0.3
 """Time constant near the target, s. Smaller: the learned difference follows the noise of single
 sightings."""
 LEARN_FAR_S = 1.0
-"""Time constant far from the target, s. Larger: a change of the difference is learned later."""
+"""Time constant far from the target, s. Larger: a change in the difference is learned more
+slowly."""
 NOWHERE = Place(np.zeros(3), 0.0)
 """Zero difference between two positions."""
 
@@ -73,7 +74,7 @@ def target_place(pose: MarkerPose, attitude: VehicleState, setup: PoseSetup) -> 
 
 def body_place(pose: MarkerPose, attitude: VehicleState, target: Place, setup: PoseSetup) -> Place:
     """Return the body's position and heading from its pose relative to a stationary target. Only
-    roll and pitch of `attitude` are used."""
+    the roll and pitch of `attitude` are used."""
     yaw_rad = wrap_rad(target.yaw_rad - pose.e_yaw_rad)
     way_m = pose.e_m + attitude.R_level_body.dot(setup.gear_body_m)
     return Place(target.position_m - rot_z(yaw_rad).dot(way_m), yaw_rad)
@@ -177,8 +178,8 @@ class TargetFeed:
         self._hand_over(ExternalPosition((x, y, z), quaternion), pose.t_s, now_s)
 
     def status(self, now_s: float) -> FeedStatus:
-        """Return the feed's status. Its problem may also be that the target was not seen from the
-        ground."""
+        """Return the feed's status. Its `problem` is also set while the target has not been seen
+        from the ground."""
         age_s = now_s - self._placed_s
         stale = age_s > self._config.hold_s
         problem = self._refusal or UNSEEN if stale or self.target is None else None
@@ -209,8 +210,8 @@ class TargetFeed:
         return ""
 
     def _learn_place(self, pose: MarkerPose, then: VehicleState) -> None:
-        """Learn the target's position from the frames since the estimate has settled. The first
-        external positions correct an estimate that has drifted without any, which tilts its
+        """Learn the target's position from the frames since the estimate has settled. Without
+        external positions, the estimate drifts; correcting it with the first ones tilts its
         attitude for about a second."""
         settled = [each for each in self._on_ground if _is_settled(each[0], then)]
         self._on_ground = [*settled, (then, target_place(pose, then, self._setup))]

@@ -151,7 +151,7 @@ def signature_distance(signature: Array, other: Array) -> float:
 
 def covered_shares(signatures: Sequence[Array]) -> dict[str, float]:
     """For each of `COVERAGE_AXES`, the spread of the view signatures divided by the required
-    spread, at most 1. Skew is the mean of both tilts."""
+    spread, capped at 1. Skew is the mean of both tilts."""
     x, y, size, *tilts = np.ptp(signatures, axis=0) if signatures else np.zeros(5)
     spreads = zip(COVERAGE_AXES, (x, y, size, sum(tilts) / 2.0), strict=True)
     return {axis: float(min(1.0, spread / GOALS[axis])) for axis, spread in spreads}
@@ -244,7 +244,7 @@ class GuidedCapture:
 
     @property
     def is_finished(self) -> bool:
-        """True if enough, varied views or `MOST_VIEWS` were taken."""
+        """True if enough views were taken and they vary enough, or if `MOST_VIEWS` were taken."""
         covered = min(covered_shares(self._signatures).values()) >= 1.0
         return len(self.taken) >= (ENOUGH_VIEWS if covered else MOST_VIEWS)
 

@@ -89,7 +89,7 @@ def check_calibration(
         own_hashes: `BoardView.picture_hash` of the images that the calibration was made from. These
             images are left out: a calibration always fits its own images, even if it is wrong.
 
-    Raises InvalidValue for too few views, or views that cannot show a wrong focal length.
+    Raises InvalidValue for too few views, or views that cannot reveal a wrong focal length.
     """
     own = [view for view in found.views if view.picture_hash in own_hashes]
     found = replace(found, views=tuple(view for view in found.views if view not in own))
@@ -144,7 +144,7 @@ def _verdict(
 
 
 def _check_evidence(free: CameraFit, deviations: Sequence[Deviation]) -> None:
-    """Raise InvalidValue if these images could not show that a focal length is wrong."""
+    """Raise InvalidValue if these images could not reveal a wrong focal length."""
     if deviations and all(d.mm95 <= UNSURE_FACTOR * allowed_error_mm(d.z_m) for d in deviations):
         return
     raise InvalidValue(

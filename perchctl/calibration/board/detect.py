@@ -277,9 +277,9 @@ def _local_axes(cells: Array, corners: Array) -> Array:
 
 # --- The corner where four squares meet, found by fitting the image around it ---
 # `cv2.cornerSubPix` has a fixed window, which includes neighbouring corners of small squares and
-# the markers of a ChArUco board. The errors of `cv2.cornerSubPix` are 0.03 to 0.5 px where this fit
-# has errors of 0.02 px. In this module, the window follows the size and slant of the square, and a
-# model of two crossing blurred edges is fitted to its grey levels:
+# the markers of a ChArUco board. `cv2.cornerSubPix` is off by 0.03 to 0.5 px where this fit is off
+# by 0.02 px. In this module, the window follows the size and slant of the square, and a model of
+# two crossing blurred edges is fitted to its grey levels:
 #
 #     I = a + gx x + gy y + (c + hx x + hy y) tanh(d1 / w1) tanh(d2 / w2)
 #

@@ -21,7 +21,7 @@ from perchctl.profile import aruco_dictionary
 from perchctl.target import Board, mm_text
 
 MOST_PICTURES = 5
-"""Number of images that are searched for a chessboard; each search takes some tenths of a
+"""Number of images that are searched for a chessboard; each search takes a few tenths of a
 second."""
 MARKER_PICTURES = 3
 """Number of these images that are searched for markers; each search takes about a second."""

@@ -275,7 +275,7 @@ _HALF_COUNTED_RAD = 0.02
 
 def guess_rotation_and_latency(gyro: GyroRotation, poses: PoseArrays) -> tuple[Array, float]:
     """Return a first estimate of R_body_cam and of the latency in s. Raises InvalidValue if no two
-    images are some tenths of a second apart."""
+    images are a few tenths of a second apart."""
     first, second = _pairs(poses.t_s)
     if len(first) < 3:
         raise InvalidValue(
