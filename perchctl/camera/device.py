@@ -21,7 +21,7 @@ PLUG_IN = "plug in the receiver or camera"
 LOST_AFTER_FAILURES = 25
 READ_RETRY_S = 0.04
 REOPEN_EVERY_S = 1.0
-"""Time between two attempts to reopen a lost camera, s: one attempt keeps a driver busy for 0.1
+"""Time between attempts to reopen a lost camera, s: each attempt keeps the driver busy for 0.1
 s."""
 
 
@@ -141,7 +141,7 @@ class ConnectedCamera:
 
 
 def find_cameras() -> list[ConnectedCamera]:
-    """Return the connected cameras in order of number. Nothing is opened. Errors: NotFound if none
+    """Return the connected cameras, sorted by number. Nothing is opened. Errors: NotFound if none
     is found, because there is none, or because the operating system does not list cameras as Linux
     does."""
     if cameras := _known_cameras(DEVICES, NAMES):

@@ -37,8 +37,8 @@ def refuse_other_kinds(path: Path) -> None:
     """Raise InvalidValue if the content of a file shows that it is neither a picture nor a video,
     or if a folder is a ROS bag.
 
-    FFmpeg would search a recording or bag for JPEGs, and play what it takes for frames: pieces of
-    images, with times that nobody measured.
+    FFmpeg would search a recording or bag for JPEGs, and play whatever it mistakes for frames:
+    fragments of images, with made-up times.
     """
     if note := kind_note(path, "a picture", "a video"):
         shown, advice = without_password(str(path)), _ADVICE.get(file_kind(path), "")

@@ -29,7 +29,7 @@ FROZEN_AFTER_S = 0.4
 UNIFORM_SIGMA = 1.5
 """Standard deviation below which an image shows nothing: a blank screen has less than 1."""
 DARK_LEVEL = 30.0
-"""Level below which an image is dark, compared with its mean plus two standard deviations."""
+"""An image is dark if its mean plus two standard deviations is below this grey level."""
 SNOW_SIGMA, SNOW_ROUGHNESS, SNOW_GRAIN = 35.0, 0.7, 0.3
 """Thresholds above which an image is snow: its standard deviation; the mean square difference of
 lines two rows apart, relative to that of unrelated pixels (1); and the same for columns two pixels

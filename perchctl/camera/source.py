@@ -127,8 +127,8 @@ class LiveSource:
     """A live source: a thread reads the camera, and the loop polls the newest frame.
 
     A subclass defines `_connection`, which opens and reads the camera. A connection that has ended
-    is reopened after `reconnect_wait_s`, until `max_failures` connections in succession have
-    brought no image.
+    is reopened after `reconnect_wait_s`, until `max_failures` successive connections have delivered
+    no image.
 
     If a source delivers no image, its message only names causes that the source has observed: it
     did or did not connect (`_connected`), something other than an image arrived (`_note`), or

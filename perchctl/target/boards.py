@@ -4,7 +4,7 @@
     inner corners (columns x rows) and the side of a square; 10x7 squares are printed.
 ``charuco:10x7:25mm:18mm:DICT_5X5_100``
     squares (columns x rows), side of a square, side of a marker, dictionary; the suffix ``:legacy``
-    selects the layout of OpenCV before 4.6, which many shops still sell.
+    selects the layout that OpenCV used before 4.6; many shops still sell such boards.
 
 Columns and rows are counted as in OpenCV's own functions. A suffix such as
 ``:measured=249.3x174.6mm`` gives the measured size of the print's black area.

@@ -164,7 +164,7 @@ def make_design(
     ceiling_m: float | None = None,
 ) -> TargetDesign:
     """The design for a profile and a ceiling `ceiling_m` above the floor (None: unknown). Far
-    ranges are found by trials of the detector, near ones from the geometry."""
+    ranges are found by running the detector on trial images, near ones from the geometry."""
     f = focal_px(camera)
     view = FieldOfView(camera)
     ahead = (np.eye(3), np.zeros(3))

@@ -188,8 +188,9 @@ def pixel_overlap(edges_m: Array, px_per_m: float, size_px: int, window_px: floa
 def merge_black_cells(black: NDArray[np.bool_], xs_m: Array, ys_m: Array) -> list[Rectangle]:
     """The black cells of a grid as few, large, non-overlapping rectangles.
 
-    `xs_m` ascends over the columns' edges, `ys_m` descends over the rows'. The rectangles are few
-    and large because viewers draw hairlines between adjacent rectangles.
+    `xs_m` are the edges of the columns in ascending order, `ys_m` those of the rows in descending
+    order. The rectangles are few and large because viewers draw hairlines between adjacent
+    rectangles.
     """
     left = black.copy()
     rows, cols = left.shape

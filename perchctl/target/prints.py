@@ -29,7 +29,8 @@ def measured_target(
     """The target with the measured sides of ``large`` and ``small``, and notes for the user. If
     both sides are given, `size_sigma` is reduced to `MEASURED_SIGMA`.
 
-    Raises InvalidValue for a side that differs more from the nominal one than any printer's error.
+    Raises InvalidValue for a side that differs from its nominal length by more than any printer's
+    error.
     """
     notes, scales = [], {}
     target = nominal
@@ -54,8 +55,8 @@ def measured_target(
 
 
 CORNER_BIAS_PX = 0.02
-"""Error of a refined corner inwards or outwards that all frames share, px; averaging over frames
-does not reduce it."""
+"""Inward or outward error of a refined corner that is the same in all frames, px; averaging over
+frames does not reduce it."""
 MIN_ERROR = 0.003
 """Smallest relative error that is reported: one printer dot on a 25 mm marker."""
 SIGMAS = 3.0

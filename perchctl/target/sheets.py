@@ -38,7 +38,7 @@ UNPRINTABLE = 5.0
 MIN_QUIET_CELLS = 0.5
 """Smallest white margin around the large marker, in cells of this marker. One cell is printed if
 the page has room for it. Down to half a cell, the detection range stays the same (the marker is
-found from 32 px on; with 0.3 cells, from 36 px on)."""
+found at 32 px and above; with 0.3 cells, at 36 px and above)."""
 
 _PT_PER_MM = 72.0 / 25.4
 RULER = 100.0
@@ -239,7 +239,7 @@ class _Paper(FPDF):
         # Not the current time, so that the same target always gives the same bytes.
         day = date or datetime.date(2000, 1, 1)
         self.set_creation_date(datetime.datetime.combine(day, datetime.time(), datetime.UTC))
-        # Portrait pages are turned about their long edge, which is the vertical one.
+        # Portrait pages are flipped on their long edge, which is the vertical one.
         duplex = "DuplexFlipLongEdge" if height >= width else "DuplexFlipShortEdge"
         self.viewer_preferences = ViewerPreferences(
             print_scaling="None", duplex=duplex if pages == 2 else None

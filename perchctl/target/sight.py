@@ -95,7 +95,7 @@ SURE_PX = 18.0
 """Side of a marker that the search finds reliably, px: it finds markers of 15 px in all rendered
 images, and a fifth is added as a margin."""
 BLURRED = 1.15
-"""Factor on the smallest side that a plain search can read despite a measured blur."""
+"""Factor applied to the smallest side that a plain search can read despite a measured blur."""
 STRAIGHT_DEG = 2.0
 """Tilt of the camera's axis below which no tilt is reported, deg."""
 LEAST_UP = 0.2

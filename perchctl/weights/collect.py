@@ -44,7 +44,7 @@ from perchctl.weights.data import HEADER, csv_row
 SEEN_SHARE = 0.9
 """Fraction of the frames at a position that must show both markers."""
 MOST_WANDER_PX = 1.0
-"""Largest drift and largest jitter of the target's image within a position, px."""
+"""Largest drift and largest jitter of the target's image at one position, px."""
 MOST_MISMATCH_M = 0.03
 """Difference from the camera's pose above which an actual pose is a mistake, m. Larger: a mistake
 is taken for an error in the camera's pose."""
