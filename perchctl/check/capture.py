@@ -219,8 +219,8 @@ HOW_TO_TURN = (
 )
 POSE_PAIR_PERIOD_S = 0.1
 LEAST_STEP_RAD, MOST_STEP_RAD = math.radians(12.0), math.radians(120.0)
-"""Range of the rotations between two times that are used: a smaller rotation may be noise, and the
-axis of a larger one is uncertain."""
+"""Smallest and largest rotation between two times that is used: a smaller rotation may be noise,
+and the axis of a larger one is uncertain."""
 MOVED_RAD, MOVED_M, MOVED_G = math.radians(12.0), 0.06, 0.05
 BODY_STILL_RAD = math.radians(4.0)
 """Rotation up to which the rigid body counts as still, rad. Larger: a moving body counts as
@@ -245,8 +245,8 @@ HAND_REACH_M = 5.0
 """Largest possible lift by hand, m. If a body seems to move farther, its positions must be in
 another unit."""
 STRANGER = 0.4
-"""If the alignment A and B leaves a larger mean share of a rotation unexplained than this, the
-motion-capture system tracks another body."""
+"""If A and B leave, on average, more than this share of a rotation unexplained, the motion-capture
+system tracks another body."""
 
 
 @dataclass(frozen=True, eq=False)

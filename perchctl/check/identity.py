@@ -60,8 +60,8 @@ class Stand:
     Attributes:
         home_text: its home in words, in room axes.
         homes: the homes of the other vehicles.
-        views: where the target of each other vehicle would appear to be if its camera were taken
-            for this vehicle's.
+        views: where the target of each other vehicle would appear to be if its camera were
+            mistaken for this vehicle's.
         lookalikes: vehicles whose cameras would show a target at the position at which this
             vehicle's own target must appear.
     """

@@ -135,8 +135,8 @@ def rehearse(
     duration_s: float = REHEARSED_S,
     stopwatch: Callable[[], float] = time.perf_counter,
 ) -> Rehearsal:
-    """Run perception for `duration_s` at the loop's rate, on the telemetry of `take` and on the
-    frames of `source`, which must have the calibrated size.
+    """Run perception for `duration_s` at the loop's rate, on the telemetry returned by `take` and
+    on the frames of `source`, which must have the calibrated size.
 
     `stopwatch` measures processing times, as `clock` may be simulated.
     """

@@ -83,14 +83,13 @@ their delay."""
 
 @dataclass(frozen=True)
 class VehicleStatus:
-    """State of a vehicle, as the check queried it.
+    """State of a vehicle, as found by the check.
 
     `device_type`: the vehicle type reported by the firmware; None if it does not answer.
     `missing_variables`: log variables that the firmware lacks. `round_trips_s`: round-trip times of
     test packets, infinite if lost. `wake_delays_s`: how late a sleeping thread on this computer
     woke up during these tests. `telemetry`: newest sample, `age_s` old. `displacement_m`: drift at
-    rest.
-    `samples`: all samples received, oldest first.
+    rest. `samples`: all samples received, oldest first.
     """
 
     uri: str

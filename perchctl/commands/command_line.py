@@ -45,7 +45,7 @@ _REFUSED: dict[int | None, str] = {
     errno.ENAMETOOLONG: "choose another place",
     errno.ENOTDIR: "choose another place",
 }
-"""Advice to the user for each error with which the operating system refuses a path."""
+"""Advice to the user for each error that the operating system reports for a path."""
 _LONGEST_PLACE = 200
 
 COMMANDS: dict[str, str] = {

@@ -326,7 +326,7 @@ _COLUMN, _WIDTH = 13, 80
 
 
 def plan_problem(options: flights.FlyOptions) -> PerchError | None:
-    """Return the error with which `fly` would refuse these options, before it opens anything."""
+    """Return the error that `fly` would raise for these options before it opens anything."""
     try:
         checks.warnings_before_flight(options)
         options.require_lift_check()

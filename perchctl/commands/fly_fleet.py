@@ -37,8 +37,8 @@ DISPLAY_PERIOD_S = 0.1
 """Update period of display and record, s. Commands are sent at once."""
 ENDING_TIMEOUT_S = 90.0
 """Time for vehicles to land and their processes to end after a failure of the parent, s. This time
-is longer than a landing and the closing of link and log take together. Shorter: a process may be
-ended while its vehicle is still flying. Longer: a failed command ends later."""
+is longer than it takes to land and then close the link and the log. Shorter: a process may be ended
+while its vehicle is still flying. Longer: a failed command ends later."""
 NUMBER_KEYS = 9
 """Number of vehicles that can be landed with a number key."""
 
@@ -87,7 +87,7 @@ def fly_fleet(plan: fleets.FleetPlan, settings: FleetSettings) -> int:
 
 
 def refuse_before_start(plan: fleets.FleetPlan, settings: FleetSettings) -> None:
-    """Raise the error with which `fly_fleet` would refuse this plan, before anything is opened or
+    """If `fly_fleet` would refuse this plan, raise its error before anything is opened or
     started."""
     folder = _parent_folder(plan, settings) / plan.fleet.name
     options = fleets.flight_options(plan, folder, settings.seed, settings.record)

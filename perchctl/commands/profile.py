@@ -246,7 +246,7 @@ def default_answer(name: str, answers: Answers) -> str:
     if name == "left":
         return left_edges(answers["front"])[0]
     if name == "target.small.side_m":
-        # an invalid side of the large marker is refused later
+        # an invalid side of the large marker is rejected later
         with contextlib.suppress(ValueError):
             return f"{max(0.004, float(answers['target.large.side_m']) / 6.0):.4g}"
     return QUESTIONS[name]

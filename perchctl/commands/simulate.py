@@ -296,7 +296,7 @@ def make_executor(
     jobs: int | None, cluster: str | None, flown: Sequence[profiles.Profile], flights: int
 ) -> AbstractContextManager[Executor]:
     """Return the executor for a campaign: processes on this computer, or the workers of a cluster,
-    which must have the files of the profiles `flown`. Errors: UsageError."""
+    which must have the files of the profiles in `flown`. Errors: UsageError."""
     if cluster is None:
         return campaigns.flight_processes(max(1, min(jobs or 1, flights)))
     if jobs is not None:
@@ -399,7 +399,7 @@ def print_log_folder(results: Sequence[campaigns.CampaignFlight], log_dir: Path 
 
 
 def log_error(results: Sequence[campaigns.CampaignFlight]) -> PerchError | None:
-    """Return the error that some of the flights' logs are incomplete; None if all are complete."""
+    """Return an error if some of the flights' logs are incomplete; None if all are complete."""
     problems = [result.log_problem for result in results if result.log_problem is not None]
     if not problems:
         return None

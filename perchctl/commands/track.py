@@ -279,7 +279,7 @@ TARGET_FRAME_ID = "target"
 
 
 def check_frame_id(frame_id: str) -> None:
-    """Raise InvalidValue for a name that tf2 refuses as the parent of `TARGET_FRAME_ID`."""
+    """Raise InvalidValue for a name that tf2 does not accept as the parent of `TARGET_FRAME_ID`."""
     if not frame_id.strip() or frame_id.startswith("/") or frame_id == TARGET_FRAME_ID:
         raise InvalidValue(
             f"--frame-id takes the name of a frame in your tf tree, such as camera_optical_frame, "
