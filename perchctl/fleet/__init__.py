@@ -25,7 +25,7 @@ A flight consists of one process per vehicle, and a parent process that sends th
         options = radios.route(options)
         children = {name: VehicleProcess(name, each) for name, each in options.items()}
         coordinator = Coordinator(plan, children, switch)   # an OperatorSwitch
-        coordinator.run(until)          # in a thread of its own; or step() by step
+        coordinator.run(until)          # in a thread of its own; or call step() repeatedly
         coordinator.confirm(), .land(name), .views, .has_ended
     read_fleet_folder(folder)           # the results and logs of such a flight
 
@@ -35,13 +35,13 @@ take off, who lands, and who is too close, as pure functions. coordinator, child
 side. prepare: checks before anything starts, and radio hubs. outcome: exit code and ``fleet.json``.
 folder: read ``fleet.json`` and the logs.
 
-load: the fleet file, and checks that two vehicles share nothing that they must not share. fleet:
-the frozen values. assignment: interchangeable targets. radio: dongles and the radio budget.
-schedule: corridors, the profiles that enforce them, and who flies when. plan: all of this in one
-call. drawing: the room from above. identify: check on the floor that vehicle, body, camera and
-home belong together. convert: lists of Crazyflies from other programs. lockstep: the simulated
-flight of a whole fleet. room: what its vehicles share. coroutine: how its flights wait for each
-other. results: how they ended.
+load: the fleet file, and checks that no two vehicles share anything that must be unique. fleet: the
+frozen values. assignment: interchangeable targets. radio: dongles and the radio budget. schedule:
+corridors, the profiles that enforce them, and who flies when. plan: all of this in one call.
+drawing: the room from above. identify: check on the floor that vehicle, body, camera and home
+belong together. convert: lists of Crazyflies from other programs. lockstep: the simulated flight
+of a whole fleet. room: what its vehicles share. coroutine: how its flights wait for each other.
+results: how they ended.
 """
 
 import lazy_loader

@@ -21,7 +21,7 @@ from perchctl.corridor import Point
 from perchctl.mission import OperatorRequest, Phase
 
 BEAT_S = 0.1
-"""Time between two messages in each direction, s. Longer: only few messages arrive within the
+"""Time between two messages in each direction, s. Longer: only a few messages arrive within the
 second after which a silent parent counts as dead. Shorter: the messages cost computing time."""
 
 

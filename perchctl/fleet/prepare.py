@@ -1,5 +1,5 @@
-"""Prepare the options for each vehicle's process, and refuse a flight that is not possible before
-any process starts."""
+"""Prepare the options for each vehicle's process and, before any process starts, refuse a flight
+that is not possible."""
 
 from __future__ import annotations
 

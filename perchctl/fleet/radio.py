@@ -242,8 +242,8 @@ def _fitted(vehicle: FleetVehicle, dongle: str, channel: int, shared_by: int) ->
 
 
 def _slower(profile: Profile, usable: float, fits: Sequence[float]) -> str:
-    """Return advice on slower telemetry, or slower positions, with which the flight would fit,
-    ending in ``, or``; empty if that is not enough."""
+    """Return the advice to slow down telemetry or positions so that the dongle can carry the
+    flight, ending in ``, or``; empty if that is not enough."""
     if fits:
         need = needed_per_s(profile, fits[0])
         return (

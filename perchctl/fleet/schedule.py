@@ -36,8 +36,9 @@ also the smallest fence radius that a profile allows (`0.3 <= safety.fence_radiu
 gusts end flights. Larger: fewer vehicles fit into a room."""
 ROOM_ERROR_M = 0.05
 """Error of a position in the room's axes, m. perchctl takes off only if estimate and motion capture
-agree within it (docs/positioning.md), and the Lighthouse geometries of two vehicles can differ by
-centimetres (bitcraze/cfcli). Smaller: two vehicles with different estimates may meet."""
+agree to within this distance (docs/positioning.md), and the Lighthouse geometries of two vehicles
+can differ by centimetres (bitcraze/cfcli). Smaller: two vehicles with different estimates may
+meet."""
 FLOW_DRIFT_MPS = 0.01
 """Drift of a Flow deck's estimate, m/s, as in the simulation (`simulation.drift_mps`). Smaller: a
 long search ends outside the corridor. Larger: Flow decks need more room."""

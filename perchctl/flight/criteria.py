@@ -296,7 +296,8 @@ class GroundCriteria:
 
     @staticmethod
     def no_position_source(decks: Sequence[str], profile: Profile) -> Problem | None:
-        """Problem: none of the detected `decks` measures positions, as the profile expects."""
+        """Problem: the profile expects a deck that measures positions, but none of the detected
+        `decks` does."""
         config = profile.positioning
         if not config.source.is_deck or {*decks} & {*POSITION_DECKS, *config.decks}:
             return None

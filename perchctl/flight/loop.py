@@ -114,9 +114,9 @@ def fly(parts: FlightParts) -> FlightReport:
     """Wait until the vehicle is ready, fly the mission, and return how it ended.
 
     The link must be connected. If anything raises an exception, the vehicle is landed (the rescue)
-    before the exception is raised. Errors: `SafetyAbort`, `TimedOut`, `NotFound` and `Interrupted`
-    before take-off, and any unforeseen error after the rescue. The report, or the error's
-    `__notes__`, contains one sentence for each watcher that was detached.
+    before the exception is re-raised. Errors: `SafetyAbort`, `TimedOut`, `NotFound` and
+    `Interrupted` before take-off, and any unforeseen error after the rescue. The report, or the
+    error's `__notes__`, contains one sentence for each watcher that was detached.
     """
     watchers = Watchers(parts.watchers, parts.clock.now, parts.remarks, parts.judges)
     try:

@@ -9,7 +9,7 @@ presses                                                   order
 one                                                       land
 two, less than `SAME_PRESS_S` apart                       land
 two, `SAME_PRESS_S` to `LONGEST_DELAY_S` apart, no third  land, and stop `KEY_REPEAT_WAIT_S` after
-                                                          the second: it was no key's first repeat
+                                                          the second: it was not a key repeat
 a second one later than that                              stop at once
 three within a second, not spaced as a key repeats        stop at once
 spaced as a key repeats                                   land for a second after the first; the
@@ -46,8 +46,8 @@ from perchctl.mission import OperatorRequest
 
 STOP_HELP = "Press Ctrl-C to land. Press it again to cut the motors."
 KEY_HELP = "The space bar cuts the motors at once."
-"""How the operator stops a flight, in one sentence. Every help text, panel, page and document uses
-it."""
+"""How the operator stops a flight. Every help text, panel, page and document uses these
+sentences."""
 
 SAME_PRESS_S = 0.3
 """Two presses that are closer together than this count as one, s. Larger: a quick second press is

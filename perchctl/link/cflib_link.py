@@ -63,7 +63,7 @@ DRAIN_S = 1.0
 """Longest wait for queued commands when the link is closed, s."""
 UNHEARD_S = 0.5
 """A packet counts as lost with the link if it was sent after the vehicle was last heard from, or
-less than this time before that, s."""
+within this time before that, s."""
 FAREWELL = RawThrust(0)
 """The command that cflib's `close_link` sends."""
 

@@ -45,8 +45,8 @@ RESET_AGREE_RAD = math.radians(5.0)
 """Largest difference between estimated and measured heading after a reset, rad: tolerable for half
 a metre of climb."""
 RESET_STILL_M = 0.05
-"""Largest motion from the reset until the agreement, m; a vehicle that moves farther is being
-carried."""
+"""Largest distance that the vehicle may move between the reset and the agreement, m; a vehicle that
+moves farther is being carried."""
 ESTIMATE_POLL_S = 0.02
 """Time between two comparisons of the estimate with the measured position, s."""
 

@@ -284,7 +284,7 @@ class Sender:
 
     def _is_replaced(self, last: _Waiting, command: Command) -> bool:
         """True if a new command replaces this one: any command replaces a setpoint, and a command
-        of the same type replaces one of which no piece has been sent."""
+        of the same type replaces any other command if no piece of it has been sent."""
         if isinstance(last.command, _STREAMED):
             return True
         return not last.begun and type(last.command) is type(command)

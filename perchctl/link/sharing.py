@@ -484,7 +484,7 @@ def run(hub: Hub, channel: Channel) -> None:
                     hub.limit(*channel.recv())
             except (EOFError, OSError):
                 parent = False
-        # A hanging parent does not read its pipe, which must not block the hub.
+        # If the parent hangs, it does not read its pipe; that must not block the hub.
         if hub.tick() and parent and select.select([], [channel], [], 0.0)[1]:
             with contextlib.suppress(OSError):
                 channel.send(hub.reports())

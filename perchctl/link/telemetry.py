@@ -293,7 +293,7 @@ class LogBlocks:
     def start(self, log: Any, uri: str, period_s: float) -> None:
         """Start the blocks in cflib's `log`, and wait for the first sample.
 
-        Raises NotFound for a refused block, and TimedOut.
+        Raises NotFound if a block cannot be added, and TimedOut.
         """
         self._started_s = self._clock()
 
@@ -368,7 +368,7 @@ def start_block(
 
     `variables` maps names to types, None for the firmware's own type. `period_s` is rounded to 10
     ms. `on_data` is called with the stamp in ms, the values by name and the block. Raises NotFound
-    for a refused block.
+    if the block cannot be added.
     """
     from cflib.crazyflie.log import LogConfig
 

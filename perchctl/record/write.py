@@ -54,8 +54,8 @@ class LogWatcher:
 
     Attributes:
         path: the log file; `open` adds ``_2``, ``_3``... to the name rather than overwrite a file.
-        problem: None, or one sentence about the first failure of the disk, or about the error for
-            which the flight detached its log.
+        problem: None, or one sentence about the first failure of the disk, or about the error that
+            made the flight detach its log.
         unencodable: None, or one sentence about the first record that could not be encoded. Only
             that record is lost, and the flight continues.
         truth: function that returns the true state at a tick; set by a simulation.
