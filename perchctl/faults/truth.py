@@ -1,5 +1,5 @@
 """The ground truth of a flight: samples of the vehicle's state for the oracle, the facts that
-determine which outcomes are expected, and the bounds within which the true vehicle must stay."""
+determine which outcomes are expected, and the bounds on the vehicle's true motion."""
 
 from __future__ import annotations
 
@@ -212,7 +212,8 @@ class FactsRecorder(Facts):
             self._hangs_s = s.t_s
 
     def _note_power(self, s: Sample) -> None:
-        """Record when four times the thrust of the weakest motor no longer lifts the weight."""
+        """Record when four times the thrust of the weakest motor first fails to lift the weight,
+        and when the battery's voltage under load is first too low."""
         vehicle, world = self._vehicle, self._vehicle.world
         lift_n = world.powertrain.max_balanced_thrust_n()
         weight_n = vehicle.scenario.mass_kg * GRAVITY_MPS2
@@ -257,7 +258,7 @@ class PositionBound:
     """The horizontal region in which the vehicle must be in each phase. During take-off, the region
     is the start (or `planner.approach_xy_m`); during search, estimate, alignment and recovery, the
     line between start and target; during ascent, press and completion, the place under a target.
-    From the beginning of a landing on, it is the point of the region that was nearest to the
+    Once a landing begins or the mission ends, it is the point of the region that was nearest to the
     vehicle at that time.
 
     A target that looks like the vehicle's own also counts as a target.

@@ -4,14 +4,15 @@
   voltage with a lag, and its thrust is the value of the thrust curve at the voltage that
   corresponds to the speed (`thrust_n`).
 - The faster the motor turns, the shorter the lag. To keep a motor at speed w, the voltage must be
-  a w + b w^2 (back EMF and the air's torque), so 1 / lag is proportional to a + 2 b w, and its
+  a w + b w^2 (back EMF and aerodynamic torque), so 1 / lag is proportional to a + 2 b w, and its
   square rises linearly with that voltage. At hover, the lag is the 0.05 s of docs/firmware.md,
   "Catching a slip". At standstill it is `STANDING_LAG_S`, with which simulated slips lose
   as much height as the slips measured in docs/firmware.md.
-- Nothing brakes a brushed motor without a voltage: at duty 0 it runs down within `MOTOR_COAST_S`,
-  the value that best fits the falls, landings and take-offs measured in docs/firmware.md. At any
-  other duty, recorded flights show the same lag in both directions (`Scenario.motors_brake`).
-- Motors of one kind differ (`Scenario.motor_strength`), and the thrust of each fluctuates
+- Nothing brakes a brushed motor without a voltage: at duty 0 it runs down with the time constant
+  `MOTOR_COAST_S`, the value that best fits the falls, landings and take-offs measured in
+  docs/firmware.md. At any other duty, recorded flights show the same lag in both directions
+  (`Scenario.motors_brake`).
+- Motors of the same kind differ (`Scenario.motor_strength`), and the thrust of each fluctuates
   (`Scenario.thrust_noise`): a first-order Gauss-Markov process, independent for each motor.
 - The cell (`Cell`) supplies 4.4 A at full thrust. Current and voltage sag are proportional to
   thrust: the voltages that docs/firmware.md lists with the duty cycles lie within 0.06 V of a
@@ -83,10 +84,11 @@ STANDSTILL_V = motor_voltage(0.0)
 
 
 # --- The cell that feeds the motors: charge, resting voltage, resistance, age ---
-# - Resting voltage by charge: the levels in tenths by which the firmware reports a battery's state
-#   (source: power management) are a discharge curve of the Crazyflie's own cell.
+# - Resting voltage by charge: the voltages from which the firmware derives the battery level in
+#   tenths (source: power management) are a discharge curve of the Crazyflie's own cell.
 # - Under load, the cell's resistance makes the voltage fall at once. In an old or cold cell, it
-#   falls further within `ION_DIFFUSION_S`, because ions have to diffuse over a longer distance.
+#   falls further, with the time constant `ION_DIFFUSION_S`, because ions have to diffuse over a
+#   longer distance.
 # - An old cell holds less charge and has more resistance; `knee` is the share of the charge at
 #   which the steep end of the curve begins.
 
