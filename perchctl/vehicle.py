@@ -79,9 +79,9 @@ class Telemetry:
         return bool(self.supervisor & supervisor_bit)
 
 
-# --- The vehicle's state according to its newest telemetry. Old telemetry counts as unknown, and an
-# unknown vehicle counts as flying. Closing the link, the rescue and the watchdog depend on this
-# state.
+# --- The vehicle's state according to its newest telemetry. If the telemetry is old, the state is
+# unknown, and the vehicle counts as flying. Closing the link, the rescue and the watchdog depend on
+# this state.
 
 
 FRESH_S = 0.3

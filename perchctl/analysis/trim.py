@@ -18,7 +18,7 @@ are `MOTOR_OFFSET_M` to the front and to the side, three patterns:
   propellers, or a tilted motor.
 - A draught adds a moment to pitch and roll (`WIND_ARM_M`), as if the centre of mass moved with the
   wind. Because it pushes off-centre (`DRAG_LEVER_M`), it also adds a moment to yaw, where the
-  motors have only little authority (`YAW_TORQUE_M`). The vehicle leans into a draught, but the
+  motors have little authority (`YAW_TORQUE_M`). The vehicle leans into a draught, but the
   estimated lean has a bias of the same size. The lean is therefore only used to widen the
   intervals, not to correct the estimate.
 """
@@ -51,7 +51,7 @@ YAW_TORQUE_M = 0.006
 """Reaction torque of a motor per unit of thrust, N.m per N."""
 UNSEEN_LEAN_RAD = math.radians(0.3)
 """Lean into a draught that the bias of the estimated lean may hide, rad, one standard deviation.
-Larger: wider intervals. Smaller: a draught is taken for an imbalance."""
+Larger: wider intervals. Smaller: a draught is mistaken for an imbalance."""
 HOVER_CLEARANCE_M = 0.3
 """Smallest distance from the floor and from the target at which samples are used, m. Smaller:
 ground or ceiling effect disturbs the estimate."""

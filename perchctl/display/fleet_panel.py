@@ -21,7 +21,7 @@ from perchctl.display.terminal import (
 _WIDTHS = {"": 2, "name": 10, "phase": 8, "height": 7, "error": 8, "battery": 7, "link": 6}
 _REASON_COLUMNS = PANEL_COLUMNS - 4 - sum(_WIDTHS.values()) - len(_WIDTHS)
 """Columns that remain for the reason: all but the panel's frame and the other fields, each followed
-by a blank."""
+by a space."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,8 +24,8 @@ PANEL_PERIOD_S = 0.1
 PANEL_CLOSE_TIMEOUT_S = 1.0
 EVENTS_KEPT = 1000
 PANEL_COLUMNS = 78
-"""Width of a panel, in columns, on a terminal of 80: the terminal echoes ^C after the panel, and
-this line must not wrap."""
+"""Width of a panel, in columns, on an 80-column terminal: the terminal echoes ^C after the panel,
+and that line must not wrap."""
 
 _STYLES = {"PERCHED": "bold green", "LANDING": "bold yellow", "ABORTED": "bold red"}
 
@@ -91,8 +91,9 @@ class TerminalDisplay:
 
 
 def _fold(line: str, columns: int) -> str:
-    """Break a line between words, and indent what follows to the text after its time. A word that
-    is longer than a line, such as a path, stays whole, so that it can be copied."""
+    """Break a line between words, and indent the continuation lines to align with the text after
+    its time. A word that is longer than a line, such as a path, stays whole, so that it can be
+    copied."""
     indent = line.find("] ") + 2 if line.startswith("[") else 0
     return textwrap.fill(
         line,

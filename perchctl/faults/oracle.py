@@ -49,7 +49,7 @@ FALL_CAUGHT_MPS = 0.05
 """Sink rate below which a fall is over at once, m/s."""
 SLOW_AGAIN_S = 0.3
 """A fall also ends once the sink rate has been below `FAST_MPS` for this time, s. Larger: the
-descent that follows counts as a part of the fall."""
+descent that follows counts as part of the fall."""
 FROM_HANGING_S = 1.0
 PRESSED_S, RELEASED_S = 4.0, 0.2
 """A vehicle that bounces off the ceiling for less than `RELEASED_S` still counts as pressing."""
@@ -76,8 +76,8 @@ REPEAT_WITHIN_S = 0.23
 repeats."""
 REPEAT_SPREAD_S = 0.021
 """Largest difference between the intervals of a key that repeats, s: the simulated clock delivers a
-press up to 10 ms early or late. Larger: presses by hand are taken for a repeating key, and the stop
-that they command need not be obeyed."""
+press up to 10 ms early or late. Larger: presses by hand are mistaken for a repeating key, and the
+stop that they command need not be obeyed."""
 
 
 class Sample(NamedTuple):

@@ -56,7 +56,7 @@ class SimProcess:
         self._channel, childs = _CONTEXT.Pipe()
         arguments = (childs, self.shared_time, pace, scenario, settings)
         self._child = _CONTEXT.Process(target=_serve_parent, args=arguments, daemon=True)
-        # The child inherits the blocked Ctrl-C until it has detached from the terminal.
+        # The child starts with Ctrl-C blocked, until it has detached from the terminal.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             self._child.start()

@@ -71,13 +71,13 @@ class Scenario:
             in the trials.
         centre_of_mass_m: x and y of the centre of mass, body axes; recorded vehicles flew as if
             their centre of mass were up to 2.4 mm off.
-        authority: angular acceleration for a torque, as a share of the data sheet's: the inertia is
-            divided by it. Recorded flights show 0.54 (0.41 to 0.69) at 1 to 6 Hz. `thrust_noise`
-            explains most of the reduction; the remainder is an assumption.
-        drag_nspm: horizontal drag, N for each m/s. In 104 recorded flights, it was 0.38 (0.36 to
+        authority: angular acceleration for a given torque, as a share of the data sheet's: the
+            inertia is divided by it. Recorded flights show 0.54 (0.41 to 0.69) at 1 to 6 Hz.
+            `thrust_noise` explains most of the reduction; the remainder is an assumption.
+        drag_nspm: horizontal drag, N per m/s. In 104 recorded flights, it was 0.38 (0.36 to
             0.41) times the mass per second, which is 0.016 at 42 g.
         airspeed_moment_nmspm: moment that lifts the nose in forward flight, and the left side in
-            flight to the left, N.m for each m/s. In the same flights, the motors counteract 0.8e-3
+            flight to the left, N.m per m/s. In the same flights, the motors counteract 0.8e-3
             forward and 0.7e-3 sideways.
         ground_effect: share of thrust that the vehicle gains on the floor. Recorded take-offs of
             three vehicles needed 0.91 of the thrust with 0 to 3 cm of clearance, and 0.965 with 3
@@ -328,8 +328,8 @@ def _tilt(sim: SimulationConfig, rng: np.random.Generator) -> tuple[float, float
     towards_rad = math.radians(float(rng.uniform(-180.0, 180.0)))
     if not tilt_rad:
         return (0.0, 0.0)
-    # A target that is higher on the side of +x is rotated about -y; one that is higher on the side
-    # of +y, about x.
+    # A target that is higher on the +x side is rotated about -y; one that is higher on the +y side,
+    # about x.
     return (tilt_rad * math.sin(towards_rad), -tilt_rad * math.cos(towards_rad))
 
 

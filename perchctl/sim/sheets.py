@@ -139,8 +139,8 @@ class CeilingTexture:
 def _finer(tile: NDArray[np.float32], zoom: int) -> NDArray[np.float32]:
     """Return the same smooth, seamless surface with more cells."""
     padded = np.pad(tile, 2, mode="wrap")
-    # Interpolate one axis after the other, without the surroundings of the tile: at the coarsest
-    # detail, this takes a third of the time.
+    # Interpolate one axis at a time, and crop the padding after each: at the coarsest detail, this
+    # takes a third of the time.
     wide = cv2.resize(padded, None, fx=zoom, fy=1, interpolation=cv2.INTER_CUBIC)
     wide = np.ascontiguousarray(wide[:, 2 * zoom : -2 * zoom])
     big = cv2.resize(wide, None, fx=1, fy=zoom, interpolation=cv2.INTER_CUBIC)

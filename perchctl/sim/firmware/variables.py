@@ -101,9 +101,9 @@ def _angle(name: str, gyro_axis: str) -> LogVariable:
     """An angle of the estimate, in degrees.
 
     Dry friction holds a hanging vehicle perfectly still, and the estimator's true attitude with it.
-    A real estimate integrates the noise of the gyroscope (some 0.001 deg), so no reading is like
-    the one before, and perchctl takes readings that repeat for frozen ones. While the vehicle hangs
-    with its motors idle, the reading therefore contains that noise.
+    A real estimate integrates the noise of the gyroscope (some 0.001 deg), so no two
+    successive readings are the same, and perchctl treats readings that repeat as frozen. While the
+    vehicle hangs with its motors idle, the reading therefore contains that noise.
     """
     read = attrgetter(f"estimator.now.{name}_deg")
     gyro = attrgetter(f"estimator.now.gyro_{gyro_axis}_dps")
