@@ -1,6 +1,6 @@
 """Check keys whose values must be consistent with each other.
 
-A profile that violates a limit in `IMPOSSIBLE` is refused when it is read; `perchctl check` and
+A profile that violates a limit in `IMPOSSIBLE` is rejected when it is read; `perchctl check` and
 `fly` warn if it violates one in `DOUBTFUL`.
 """
 

@@ -281,8 +281,8 @@ def _place_beside(
 
 
 def read_yaml(path: Path, expected: str = "a profile") -> dict[str, Any]:
-    """Return the keys and values of a YAML file, unchecked. `expected`: what messages say that the
-    file should be. Errors: NotFound, InvalidValue."""
+    """Return the keys and values of a YAML file, unchecked. `expected`: what the file should be,
+    for messages. Errors: NotFound, InvalidValue."""
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError:

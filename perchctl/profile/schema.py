@@ -65,7 +65,7 @@ class LinkConfig(Section):
     @field_validator("parameters")
     @classmethod
     def _turn_no_motor(cls, parameters: dict[str, int | float]) -> dict[str, int | float]:
-        """Refuse parameters that turn motors at once, because they are set before the operator is
+        """Reject parameters that turn motors at once, because they are set before the operator is
         asked."""
         for name in parameters:
             if name.startswith(MOTOR_PARAMETERS):

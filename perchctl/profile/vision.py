@@ -158,7 +158,7 @@ class CameraConfig(Section):
     @field_validator("latency_s", mode="before")
     @classmethod
     def _a_time_or_measured(cls, latency_s: Any) -> Any:
-        """Refuse any value other than a time or ``measured``, in one sentence."""
+        """Reject any value other than a time or ``measured``, in one sentence."""
         number = isinstance(latency_s, (int, float)) and not isinstance(latency_s, bool)
         if latency_s == "measured" or (number and 0.0 <= latency_s <= MOST_CAMERA_LATENCY_S):
             return latency_s
@@ -274,7 +274,7 @@ class TargetConfig(Section):
 
 
 class DetectorConfig(Section):
-    """The profile's `detector`: how markers are searched and measured."""
+    """The profile's `detector`: how markers are found and measured."""
 
     refinement: Literal["subpix", "line"] = key(
         "line",
@@ -291,7 +291,7 @@ class DetectorConfig(Section):
 
 
 class PoseConfig(Section):
-    """The profile's `pose`: how a pose is solved from corners."""
+    """The profile's `pose`: how a pose is computed from corners."""
 
     solver: ClassVar[str] = "sqpnp"  # OpenCV's method for the first guess
     refine: ClassVar[bool] = True  # refine the pose by least squares on the corners
