@@ -65,7 +65,7 @@ class Rehearsal:
         target: the final estimate; None if the target was not in view.
         target_places: time and position of the target, m, in each image in which it was measured
             since the vehicle came to rest.
-        prints: the comparison of both markers; None for too few frames.
+        prints: the comparison of the two markers' apparent sizes; None for too few frames.
         blur_px: sigma of the markers' edges; None if not measured.
         scheme: the kind of source, such as ``camera``, on which the advice depends.
     """
