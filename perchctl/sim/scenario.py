@@ -62,7 +62,7 @@ class Scenario:
         target_tilt_rad: the target's rotations about the world's x and y axes, after its heading.
         capture_holes_s: start and duration of each period in which motion capture does not see the
             vehicle.
-        neighbours: other vehicles' targets; their downwash is in the draught.
+        neighbours: other vehicles' targets on the same ceiling.
         motor_strength: thrust of M1..M4 at the same duty, as shares of the data sheet's. In steady
             flight, the strongest and the weakest motor of a recorded vehicle differ by 17 % of the
             mean (7 to 40).
