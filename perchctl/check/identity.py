@@ -10,7 +10,7 @@ target   its camera sees its target at the position expected from this home
 The vehicle, its rigid body and the target in its camera's view are each compared with the home, so
 none of them can belong to another vehicle. If another vehicle's camera would show the same image,
 or if the target is not in view, perchctl asks the user to cover the lens, and identifies the camera
-whose image goes dark. Nothing is armed, and no motor turns.
+whose image goes dark. No vehicle is armed, and the motors stay off.
 """
 
 from __future__ import annotations
@@ -236,7 +236,7 @@ def _target_finding(view: View, ask: Ask | None) -> Finding:
             view,
             own,
             ask,
-            f"the camera of {stand.lookalikes[0]} would see its own target at the same position",
+            f"{stand.lookalikes[0]}'s camera would see its own target at the same position",
         )
     anywhere = target.model_copy(update={"expected_xy_m": None})
     other_m = _target_place(view.rehearse(view.profile.model_copy(update={"target": anywhere})))
@@ -247,7 +247,10 @@ def _target_finding(view: View, ask: Ask | None) -> Finding:
         )
         there = _nearest(other_m, stand.views, target.expected_within_m)
         if there is not None:
-            found += f", as the camera of {there} would"
+            found += (
+                f", at the position where {there}'s camera would see its own target; the two "
+                "cameras may be swapped"
+            )
         return failed(found, "correct source, target_m, home_m or heading_deg")
     if ask is not None:
         return _covered_finding(view, own, ask, "its target is not in view")

@@ -109,7 +109,8 @@ def test_the_camera_of_another_vehicle_is_named(sim: SimProcess, relay: Relay) -
     assert rows["target"].verdict is Verdict.FAIL
     assert re.search(r"a target 0\.[56]\d m from the vehicle's own", rows["target"].found)
     assert rows["target"].found.endswith(
-        "from the vehicle's own target, as the camera of east would"
+        "from the vehicle's own target, at the position where east's camera would see its own "
+        "target; the two cameras may be swapped"
     )
 
 
@@ -133,7 +134,7 @@ def test_a_lens_that_is_not_covered_proves_nothing(sim: SimProcess, relay: Relay
     stand = Stand(name="north", home_m=(0.0, 0.0), home_text="home", lookalikes=("east",))
     row = rows_of(relay.uri, sim, stand, lambda question: "blink" in question)["target"]
     assert row.verdict is Verdict.FAIL
-    assert "the camera of east would see its own target at the same position" in row.found
+    assert "east's camera would see its own target at the same position" in row.found
 
 
 def test_a_body_at_another_home_is_named(sim: SimProcess, relay: Relay) -> None:
