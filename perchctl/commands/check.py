@@ -83,8 +83,8 @@ def check(
     """Check vehicle, camera, computer and profile on the ground, and report what is not fit to fly.
 
     Each check passes, warns, fails, or is skipped if perchctl cannot evaluate it. perchctl does
-    not arm the vehicle, and no motor turns. The exit code is 0 if no check fails, 10 if the vehicle
-    does not answer, 20 if the camera delivers no image, and 52 if any other check fails.
+    not arm the vehicle, and the motors stay off. The exit code is 0 if no check fails, 10 if the
+    vehicle does not answer, 20 if the camera delivers no image, and 52 if any other check fails.
     """
     if cameras:
         say_on_terminal("listing the cameras")
@@ -142,7 +142,7 @@ def format_rows(rows: Sequence[checks.Row], finished: bool = True) -> str:
     ends = [f"not fit to fly: {', '.join(failing)}"] if failing else []
     if not finished:
         ends.append("not finished: the other checks were not run")
-    return "\n".join([*lines, f"{counted}: {'; '.join(ends) or 'nothing fails'}"])
+    return "\n".join([*lines, f"{counted}: {'; '.join(ends) or 'no check failed'}"])
 
 
 def _folded(rows: Sequence[checks.Row]) -> Iterator[checks.Row]:

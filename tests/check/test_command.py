@@ -92,7 +92,7 @@ def test_ctrl_c_ends_with_what_was_found(
     assert "Ctrl-C" in printed.err
     assert ("supervisor" in printed.out) is (stage == "opening")
     assert not printed.out or "not finished" in printed.out
-    assert "nothing fails" not in printed.out
+    assert "no check failed" not in printed.out
 
 
 ROWS = [
@@ -119,7 +119,7 @@ def test_the_table_fits_80_columns_and_says_what_to_do() -> None:
     assert "skip  3 checks         the vehicle does not answer" in format_rows(skipped)
     assert format_rows(skipped).splitlines()[-1].startswith("3 skip")
     assert lines[-1] == "1 pass, 1 warn, 1 FAIL, 2 skip: not fit to fly: battery"
-    assert format_rows(ROWS[:2]).splitlines()[-1].endswith("nothing fails")
+    assert format_rows(ROWS[:2]).splitlines()[-1].endswith("no check failed")
     assert "not finished" in format_rows(ROWS[:2], finished=False).splitlines()[-1]
 
 
