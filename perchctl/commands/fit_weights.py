@@ -63,9 +63,9 @@ def fit(
 
     Each CSV row describes one image. The columns are position (a number that identifies the
     place), t_s, and x_m, y_m, z_m and yaw_rad with each of the prefixes large_, small_ and
-    actual_. The cells of a marker that was not detected are empty. All three poses are in the same
-    coordinate frame; fit-weights collect writes the target's pose relative to the gear, in the
-    level frame.
+    actual_. If a marker was not detected in an image, its columns are empty in that row. All three
+    poses are in the same coordinate frame; fit-weights collect writes the target's pose relative to
+    the gear, in the level frame.
     """
     if output is not None:
         if same_file(output, data):

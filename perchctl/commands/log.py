@@ -90,8 +90,8 @@ def show(file: LogArgument = None, as_json: JsonOption = False) -> None:
     """Show, plot, compare, export, replay, film or summarise a flight from its log.
 
     All subcommands read the logs of real and simulated flights, even if perchctl was killed in
-    flight, and the logs of older perchctl versions. Only replay needs complete tick records, which
-    log versions 1 and 2 do not contain.
+    flight, and the logs of older perchctl versions. The exception is replay: it needs complete tick
+    records, which log versions 1 and 2 do not contain.
     """
     with _opened(_log_file(file)) as log:
         flight = analysis.FlightAnalysis(log)
@@ -202,7 +202,7 @@ def replay(
         bool,
         typer.Option(
             "--pictures/--no-pictures",
-            help="Process the recorded images again, if there are any.",
+            help="If there is a recording next to the log, process its images again.",
         ),
     ] = True,
     as_json: JsonOption = False,
@@ -261,8 +261,8 @@ def report(
 ) -> None:
     """Write a page that describes one or more flights in sentences and plots.
 
-    For the folder of a fleet's flight (with a fleet.json), perchctl writes one page about all of
-    its vehicles.
+    If you pass the folder of a fleet flight (with a fleet.json), perchctl writes one page
+    about all of its vehicles.
     """
     logs: list[Path] = []
     names: dict[Path, str] = {}
@@ -314,8 +314,8 @@ def film(
 ) -> None:
     """Make a film of a flight: camera image, side view to scale, error and thrust.
 
-    The camera image needs a recording next to the log (fly --record). For the folder of a
-    fleet's flight (with a fleet.json), perchctl makes one film of all its vehicles: room from
+    The camera image needs a recording next to the log (fly --record). If you pass the folder of a
+    fleet flight (with a fleet.json), perchctl makes one film of all its vehicles: room from
     above, heights and camera images.
     """
     fleet = fleets.read_fleet_folder(file) if file is not None and file.is_dir() else None
