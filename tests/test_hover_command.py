@@ -62,4 +62,4 @@ def test_a_refusal_names_the_command() -> None:
     Path("bad.yaml").write_text("extends: sim\ncamera: {mount: {rpy_deg: [90, 0, 0]}}\n")
     done = run("hover", "-p", "bad.yaml", "--dry-run")
     assert done.code == 52
-    assert "hover would refuse this: " in done.stderr
+    assert "hover would refuse to start: " in done.stderr

@@ -231,7 +231,7 @@ def fly(
     print_result(add_problem(plan.record(), refused) if as_json else plan_text(plan))
     if refused is None:
         return 0
-    say(f"perchctl fleet fly would refuse this: {refused}")
+    say(f"perchctl fleet fly would refuse to start: {refused}")
     return refused.exit_code
 
 

@@ -126,7 +126,7 @@ def plan_or_fly(
         print_result(add_problem(plan_record(options), refused) if as_json else plan_text(options))
         if refused is None:
             return 0
-        say(f"{command_name(options.profile)} would refuse this: {refused}")
+        say(f"{command_name(options.profile)} would refuse to start: {refused}")
         return refused.exit_code
     for warning in checks.warnings_before_flight(options):
         say(f"check: {warning}")
