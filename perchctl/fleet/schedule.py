@@ -276,8 +276,8 @@ def _refuse_circles(precedences: Sequence[Precedence], corridors: dict[str, Corr
         there, back = by_pair.get((first, second)), by_pair.get((second, first))
         if there is not None and back is not None:
             raise InvalidValue(
-                f"{first} and {second} cannot fly in any order: {there.why}, and {back.why}; "
-                f"{_advice(first, second, corridors)}"
+                f"there is no order in which {first} and {second} can fly: {there.why}, and "
+                f"{back.why}; {_advice(first, second, corridors)}"
             )
     sorter: TopologicalSorter[str] = TopologicalSorter()
     for first, then in by_pair:
@@ -288,7 +288,7 @@ def _refuse_circles(precedences: Sequence[Precedence], corridors: dict[str, Corr
         circle = error.args[1]  # each vehicle must fly before the next one
         each = by_pair[circle[0], circle[1]]
         raise InvalidValue(
-            f"{each.first} and {each.then} cannot fly in any order, because the order "
+            f"there is no order in which {each.first} and {each.then} can fly, because the order "
             f"{' before '.join(circle)} would be needed: {each.why}; "
             f"{_advice(each.first, each.then, corridors)}"
         ) from None
@@ -302,8 +302,9 @@ def _advice(first: str, then: str, corridors: dict[str, Corridor]) -> str:
         f"radius of {least_m:.2f} m is enough instead of {radius_m:.2f} m"
     )
     return (
-        f"a waiting or hanging vehicle must be {OBSTACLE_M:g} m away from another vehicle's "
-        f"corridor: move a home or target farther away{more if radius_m > least_m else ''}"
+        f"a waiting or hanging vehicle must be at least {OBSTACLE_M:g} m away from "
+        f"another vehicle's corridor: move a home or target farther "
+        f"away{more if radius_m > least_m else ''}"
     )
 
 

@@ -179,15 +179,15 @@ def test_who_waits_in_another_s_corridor_flies_first() -> None:
 
 def test_who_would_hang_in_each_other_s_corridor_is_refused_with_both_names() -> None:
     assert refusal(fleet([((0, 0), (1, 0)), ((2, 0), (1.2, 0))])) == (
-        "v0 and v1 cannot fly in any order: v1 hangs 0.15 m inside the corridor of v0, and v0 "
-        "hangs 0.15 m inside the corridor of v1; a waiting or hanging vehicle must be 0.24 m away "
-        "from another vehicle's corridor: move a home or target farther away"
+        "there is no order in which v0 and v1 can fly: v1 hangs 0.15 m inside the corridor of v0, "
+        "and v0 hangs 0.15 m inside the corridor of v1; a waiting or hanging vehicle must be at "
+        "least 0.24 m away from another vehicle's corridor: move a home or target farther away"
     )
 
 
 def test_a_drifting_estimate_is_the_reason_that_is_named() -> None:
     sentence = refusal(fleet([((0, 0), (0.2, 0)), ((1, 0), (1, 0.2))], "target"))
-    assert "v0 and v1 cannot fly in any order" in sentence
+    assert "there is no order in which v0 and v1 can fly" in sentence
     assert "a corridor radius of 0.35 m is enough instead of 1.00 m" in sentence
 
 
@@ -195,7 +195,9 @@ def test_a_circle_of_three_is_refused() -> None:
     """Each waits in the way of the next one."""
     ways: list[tuple[Point, Point]] = [((0, 0), (2, 0)), ((2, 0), (2, 2)), ((2, 2), (0, 0.4))]
     sentence = refusal(fleet(ways, order="together"))
-    assert re.match(r"v\d and v\d cannot fly in any order, because the order v\d before ", sentence)
+    assert re.match(
+        r"there is no order in which v\d and v\d can fly, because the order v\d before ", sentence
+    )
 
 
 def test_a_target_beyond_the_fence_is_refused() -> None:
