@@ -31,7 +31,7 @@ class RestState(Enum):
     phrase without a full stop."""
 
     HANGS = "the vehicle is hanging on the magnet with its motors off"
-    HELD = "something holds the vehicle away from the target; the motors are off"
+    HELD = "something holds the vehicle in place, away from the target; the motors are off"
     STANDS = "the vehicle is on the floor with its motors off"
     UNKNOWN = "the motors are off; it is unknown whether the vehicle is hanging or on the floor"
     END_UNCONFIRMED = "the end of the flight could not be confirmed: keep away from the vehicle"

@@ -544,7 +544,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         "held",
         PHASES_IN_WHICH_MAGNET_MAY_ATTACH,
         is_held_by_other_object,
-        "something holds the vehicle away from the target",
+        "something holds the vehicle in place, away from the target",
         diagnosis=VehicleDiagnosis.HELD_BY_OTHER_OBJECT,
     ),
     land_row(

@@ -118,8 +118,8 @@ LANDING = PhaseDefinition(
         abort_during_landing_row(
             "held-elsewhere",
             make_rest_state_predicate(RestState.HELD),
-            "motors off; something holds the vehicle away from the target: look before you touch "
-            "it",
+            "motors off; something holds the vehicle in place, away from the target: look before "
+            "you touch it",
         ),
         abort_during_landing_row(
             "hangs-or-stands",
