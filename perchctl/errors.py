@@ -98,7 +98,7 @@ class ConnectionFailed(PerchError):
 
 class NotFound(PerchError):
     exit_code = 20
-    meaning = "file, profile, firmware variable or camera not found, or camera refuses"
+    meaning = "file, profile, firmware variable or camera not found, or camera cannot be opened"
 
 
 class InvalidValue(PerchError):
@@ -108,7 +108,7 @@ class InvalidValue(PerchError):
 
 class TimedOut(PerchError):
     exit_code = 40
-    meaning = "timeout before the flight, such as no image from the camera in time"
+    meaning = "timeout before the flight, for example while waiting for an image from the camera"
 
 
 class TargetNotFound(PerchError):

@@ -140,7 +140,7 @@ def test_nobody_listens(server: RtspServer, host: str, words: str) -> None:
     with pytest.raises(NotFound, match=words) as caught:
         open_camera(url.replace("127.0.0.1", host or "127.0.0.1"), Clock(), timeout_s=WAIT_S)
     assert "secret" not in str(caught.value)
-    assert "camera refuses" in EXIT_CODES[caught.value.exit_code]
+    assert "camera cannot be opened" in EXIT_CODES[caught.value.exit_code]
 
 
 def test_a_stream_without_a_picture_says_so(server: RtspServer, opened: list[LiveSource]) -> None:
