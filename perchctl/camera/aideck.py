@@ -73,7 +73,7 @@ class _Picture:
             return "the JPEG is damaged"
         if (width, height) != (self.width, self.height):
             announced = f"{self.width}x{self.height}"
-            return f"the JPEG has {width}x{height} px, but the header announces {announced}"
+            return f"the JPEG is {width}x{height} px, but the header announces {announced}"
         image = decode_grey(data[:end])
         if image is None or image.shape != shape:
             return "the JPEG cannot be decoded"
@@ -90,7 +90,7 @@ class AiDeckSource(LiveSource):
     """
 
     unreached_advice = (
-        "check that this computer is in the deck's Wi-Fi network and that the address is right"
+        "check that this computer is on the deck's Wi-Fi network and that the address is right"
     )
     silent_advice = "switch the Crazyflie off and on again"
 

@@ -282,7 +282,7 @@ class FlightInputs:
         height, width = frame.image.shape[:2]
         if (width, height) != (size_px := self.pipeline.camera.size_px):
             return (
-                f"the picture has {width}x{height} px, but the calibration was made at "
+                f"the picture is {width}x{height} px, but the calibration was made at "
                 f"{size_px[0]}x{size_px[1]} px"
             )
         live = self.source.live

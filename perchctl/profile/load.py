@@ -204,7 +204,7 @@ def read_mask(name: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
     height, width = image.shape[:2]
     if (width, height) != size_px:
         raise InvalidValue(
-            f"camera.mask: {path} has {width}x{height} px, but the calibration was made at "
+            f"camera.mask: {path} is {width}x{height} px, but the calibration was made at "
             f"{size_px[0]}x{size_px[1]} px: make the mask from this camera's images"
         )
     covered = np.asarray(image > _WHITE)

@@ -228,7 +228,7 @@ def _convert_to_grey(frame: Frame, camera: CameraModel) -> Frame:
     height, width = grey.shape
     if (width, height) != size_px:
         raise InvalidValue(
-            f"the picture has {width}x{height} px, but the calibration was made at "
+            f"the picture is {width}x{height} px, but the calibration was made at "
             f"{size_px[0]}x{size_px[1]} px: calibrate the camera at this size"
         )
     return frame

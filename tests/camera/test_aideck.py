@@ -169,7 +169,7 @@ NEVER_WHOLE_LIKEWISE = [
     ([console(), NEVER], "data arrives, but no picture: check that the deck runs wifi"),
     ([TRUNCATED, NEVER], "pictures arrive but are dropped (1 so far): the JPEG is incomplete"),
     ([DAMAGED, NEVER], "pictures arrive but are dropped (1 so far): the JPEG is damaged"),
-    ([header(324, 244, SIZE, 1) + b"".join(SMALLER[1:]), NEVER], "has 162x122 px, but the header"),
+    ([header(324, 244, SIZE, 1) + b"".join(SMALLER[1:]), NEVER], "is 162x122 px, but the header"),
     ([b"".join(WHOLE[:-1]) + packet(bytes(1020)), NEVER], "the header announces 79056"),
 ]  # fmt: skip
 
