@@ -25,7 +25,7 @@ ACTIONS = {
     "ALIGN": "it moved under the target",
     "ASCEND": "it climbed",
     "PERCH": "it pressed against the target",
-    "COMPLETE": "it put its weight on the magnet",
+    "COMPLETE": "it transferred its weight to the magnet",
     "RECOVER": "it backed off",
     "HOVER": "it hovered under the target",
     "LANDING": "it landed",

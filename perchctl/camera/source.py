@@ -383,7 +383,9 @@ class GuardedSource:
             raise TypeError(f"poll must return a Frame or None, not {type(frame).__name__}")
         now_s = self._clock()
         if self.live and not frame.t_s <= now_s:
-            raise ValueError(f"a frame's t_s must be in the past, not {frame.t_s} at {now_s}")
+            raise ValueError(
+                f"a frame's t_s must be in the past, not {frame.t_s} (it is now {now_s})"
+            )
         if self.live and frame.t_s <= self._newest_s:
             return None
         self._newest_s, self._count = frame.t_s, self._count + 1

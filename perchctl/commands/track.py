@@ -283,7 +283,7 @@ def check_frame_id(frame_id: str) -> None:
     if not frame_id.strip() or frame_id.startswith("/") or frame_id == TARGET_FRAME_ID:
         raise InvalidValue(
             f"--frame-id takes the name of a frame in your tf tree, such as camera_optical_frame, "
-            f"without / at its beginning, and not {TARGET_FRAME_ID}; found {frame_id!r}"
+            f"without a leading / and other than {TARGET_FRAME_ID}; found {frame_id!r}"
         )
 
 

@@ -21,7 +21,7 @@ Flag = str
 FLAGS: dict[Flag, str] = {
     "crashed": "perchctl ended with an exception that no fault injected",
     "fell": "fell, touched down faster than 0.8 m/s, or slipped too far down",
-    "slid": "touched down faster than 0.5 m/s sideways",
+    "slid": "touched down at more than 0.5 m/s sideways",
     "flies_on": "motors on in the air after the vehicle should have landed",
     "endless": "did not end within 240 s",
     "stop_not_obeyed": "motors still on 0.5 s after the command to cut them",

@@ -211,7 +211,7 @@ class LandingConfig(Section):
         0.3, "height above the ground at which the firmware takes over the landing", ge=0.1, le=2
     )
     undershoot_m: float = key(
-        0.05, "distance from the ground down to the landing's target height", ge=0, le=1
+        0.05, "how far below the ground the landing's target height is", ge=0, le=1
     )
     drift_mps: ClassVar[float] = 0.012  # assumed drift of the estimated height
     timeout_s: float = key(30.0, "time limit for a landing", gt=0, le=120)

@@ -77,7 +77,7 @@ FIELDS: dict[str, str] = {
     "tel_age_s": "age of the telemetry sample",
     # external positions, as sent to the vehicle; None if its decks measure the position
     "pos_age_s": "age of the last external position sent, measured from its exposure",
-    "pos_note": "why no external position is sent now",
+    "pos_note": "why no external position is being sent",
     **_axes("pos_{}_m", "last external position sent, in the world frame of the state estimate"),
     # the camera frame; None in a tick without a new frame
     "frame": "number of the frame that this tick processed",

@@ -197,7 +197,9 @@ class Recorder:
         self._flushed_pictures = self._written_pictures
         free_bytes = self._stream.free_bytes()
         if self._written_bytes > self._most_bytes:
-            self._end(f"it reached log.max_mb in the profile, {self._most_bytes / 1e6:g}")
+            self._end(
+                f"it reached the limit log.max_mb in the profile, {self._most_bytes / 1e6:g} MB"
+            )
         elif free_bytes < RESERVE_BYTES:
             self._end(f"the last {free_bytes / 1e6:.0f} MB of the disk are reserved for the log")
         if self._over:

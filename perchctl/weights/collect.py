@@ -111,7 +111,7 @@ def position_fault(readings: list[MarkerReading]) -> str | None:
     if len(centers) < SEEN_SHARE * count:
         return (
             f"both markers were seen together in only {len(centers)} of {count} frames; "
-            "move so that both are wholly in view"
+            "move the camera so that both are wholly in view"
         )
     thirds = np.array([part.mean(axis=0) for part in np.array_split(centers, 3)])
     drift_px = float(np.linalg.norm(np.ptp(thirds, axis=0)))
