@@ -108,7 +108,7 @@ class InvalidValue(PerchError):
 
 class TimedOut(PerchError):
     exit_code = 40
-    meaning = "timeout before the flight, for example while waiting for an image from the camera"
+    meaning = "timeout before the flight, for example because no image from the camera arrived"
 
 
 class TargetNotFound(PerchError):
