@@ -123,7 +123,7 @@ class SimulationConfig(Section):
     )
     thrust_scale: Range = key((0.95, 1.1), "thrust of all motors, relative to the data sheet")
     authority: Range = key(
-        (0.55, 1.0), "angular acceleration per torque, relative to the data sheet"
+        (0.55, 1.0), "angular acceleration that a given torque produces, relative to the data sheet"
     )
     drag_nspm: Range = key((0.015, 0.0175), "horizontal drag, in N per m/s of airspeed")
     airspeed_moment_nmspm: Range = key(
