@@ -110,6 +110,11 @@ EXPECTED_OUTCOMES = (
         _let_go_later,
     ),
     ExpectedOutcome(
+        "released in silence",
+        "0.5 s after the last setpoint the firmware replaces it; the magnet then let go",
+        lambda facts: facts.released_in_silence_s,
+    ),
+    ExpectedOutcome(
         "too low to catch",
         "recovering from a fall takes up to 0.8 m of height; the vehicle was hanging below 1 m",
         _too_low,

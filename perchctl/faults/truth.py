@@ -97,6 +97,9 @@ CUT_S = 1.9
 LOCKS_S = 0.1
 """Time from the cut until the lock shows, s. Packets that arrive in this time cannot prevent the
 lock."""
+LEVELS_S = 0.5
+"""Silence after which the firmware levels the vehicle out and replaces the program's setpoint by
+its own, s (docs/firmware.md, "When setpoints stop")."""
 TOPPLES_S, TOPPLED_UP_Z = 0.3, 0.5
 """Time after a slip within which a vehicle whose motors were stopped cannot have regained control,
 s, and the tilt beyond which it has turned over in this time, as the z component of its body's z
@@ -123,6 +126,8 @@ class Facts:
             monitors it.
         slipped_s: when the vehicle first came off the magnet with its motors stopped, at the height
             `slip_height_m`; `toppled`: it turned over within `TOPPLES_S`.
+        released_in_silence_s: when the vehicle first came off the magnet after the firmware had
+            replaced the setpoint because no packet arrived.
         weak_s: when battery and motors first became unable to lift the weight.
         battery_low_s, battery_low_m: time and height at which the battery's voltage under load was
             first too low.
@@ -140,6 +145,7 @@ class Facts:
     slipped_s: float | None = None
     slip_height_m: float = 0.0
     toppled: bool = False
+    released_in_silence_s: float | None = None
     weak_s: float | None = None
     battery_low_s: float | None = None
     battery_low_m: float = 0.0
@@ -201,8 +207,11 @@ class FactsRecorder(Facts):
             self.hung_through_watch = (
                 self._hangs_s is not None and s.t_s - self._hangs_s >= self._watch_s
             )
-        came_off = before is not None and before.hanging and not s.hanging and not s.motors_on
-        if came_off and self.slipped_s is None:
+        came_off = before is not None and before.hanging and not s.hanging
+        silent = self._silent_s is not None and s.t_s - self._silent_s >= LEVELS_S
+        if came_off and silent and self.released_in_silence_s is None:
+            self.released_in_silence_s = s.t_s
+        if came_off and not s.motors_on and self.slipped_s is None:
             self.slipped_s, self.slip_height_m = s.t_s, s.height_m
         if self.slipped_s is not None and s.t_s - self.slipped_s <= TOPPLES_S:
             self.toppled = self.toppled or s.body_up_z < TOPPLED_UP_Z

@@ -159,6 +159,18 @@ def test_a_cut_shows_only_after_the_silence_that_brought_it(
     assert (it.facts.silence_lock_s is not None) is cut
 
 
+@pytest.mark.parametrize(("silent_s", "released"), [(0.4, False), (0.6, True)])
+def test_a_vehicle_that_the_firmware_releases_from_the_magnet_in_silence(
+    silent_s: float, released: bool
+) -> None:
+    it = Recorded().show(HANGING, 1.0, motors_on=True)
+    it.show(HANGING, silent_s, motors_on=True, uplink=False).show(HOVER, 0.5, uplink=False)
+    off_s = pytest.approx(1.0 + silent_s) if released else None
+    assert it.facts.released_in_silence_s == off_s
+    it = Recorded().show(HANGING, 1.0, motors_on=True).show(HOVER, 2.0)
+    assert it.facts.released_in_silence_s is None
+
+
 def test_a_landing_of_the_vehicle_s_own_is_kept_that_began_before_the_silence() -> None:
     it = Recorded().show(HOVER, 1.0)
     it.planner.active = True
