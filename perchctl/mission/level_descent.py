@@ -132,6 +132,11 @@ MAX_THRUST_TO_HOVER_RATIO_IF_SEEN_STANDING = 0.75
 """Fraction of the hover thrust below which a vehicle that does not move in the pictures must be on
 the floor: in the air, it would sink at 1 m/s. Larger: a slow start of the descent looks like the
 floor. Smaller: the motors run on the floor for longer."""
+SEEN_STANDING_DWELL_S = 0.5
+"""Time for which the thrust must have been too low before pictures without motion show the floor,
+s: in the air, the vehicle would sink at 1.2 m/s by then, and pictures show that after a quarter of
+a second. Larger: the motors run on the floor for longer. Smaller: a vehicle that stops climbing
+counts as standing."""
 MAX_THRUST_RAMP_INTEGRATION_STEP_S = 0.1
 """Longest time between two ticks that the ramp integrates, s."""
 
@@ -202,16 +207,17 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
     )
     measured_mps = _last_measured_climb_mps(c)
     climb_mps = measured_mps + descent.climb_rate_change_not_yet_measured_mps
-    is_sinking, ramp_per_s = (
-        climb_mps <= -MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS,
+    may_be_held, ramp_per_s = (
+        climb_mps > -MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS,
         THRUST_RAMP_DOWN_RATE_HOVER_FRACTION_PER_S,
     )
-    # If the speed comes from pictures, only the measured speed can show that the vehicle is
-    # sinking, not the predicted effect of commands: a vehicle on the floor does not respond to
-    # commands.
+    # If the speed comes from pictures, only the measured speed can show that the vehicle is moving,
+    # not the predicted effect of commands: a vehicle on the floor does not respond to commands. One
+    # that is still climbing is held by nothing; a ramp that began with the small thrust that brakes
+    # the climb would let it fall.
     if _visual_motion_if_telemetry_old(c) is not None:
-        is_sinking, ramp_per_s = (
-            measured_mps <= -MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS,
+        may_be_held, ramp_per_s = (
+            abs(measured_mps) < MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS,
             CAMERA_GUIDED_RAMP_DOWN_HOVER_FRACTION_PER_S,
         )
     hover_thrust = hover.estimate_hover_thrust(b).thrust
@@ -220,9 +226,7 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
     thrust = _compute_thrust_for_sink_rate(c, hover_thrust, climb_mps, height_m)
     if age_s > hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S:
         thrust *= THRUST_FACTOR_IF_CLIMB_RATE_UNKNOWN
-    floor_detected_at_s = _find_floor_detection_time_s(
-        c, hover_thrust, height_m, is_sinking=is_sinking
-    )
+    floor_detected_at_s = _find_floor_detection_time_s(c, height_m, measured_mps)
     touched_s = math.inf if floor_detected_at_s is None else c.t_s - floor_detected_at_s
     # In the air, the accelerometer reading is proportional to the thrust; on the floor, it is 1 g.
     falls = b.is_imu_fresh and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover_thrust)
@@ -242,7 +246,7 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
         thrust = TOUCHDOWN_TO_HOVER_THRUST_RATIO * hover_thrust
     elif _is_target_redetected_without_velocity(c):
         thrust = before
-    elif floor_detected_at_s is not None or carried or not is_sinking or overdue:
+    elif floor_detected_at_s is not None or carried or may_be_held or overdue:
         thrust = min(thrust, before - ramp_per_s * hover_thrust * dt_s)
     thrust = max(MIN_COMMANDED_TO_HOVER_THRUST_RATIO * hover_thrust, min(MAX_RAW_THRUST, thrust))
     # Speed that the commands since the newest sample have caused.
@@ -254,12 +258,16 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
         descent.climb_rate_change_not_yet_measured_mps * max(0.0, 1.0 - shown_s / age_s)
         + gained_mps
     )
+    supports = thrust >= MAX_THRUST_TO_HOVER_RATIO_IF_SEEN_STANDING * hover_thrust
     state = _forget_contact_after_fall(c)
     state = replace(
         state,
         descent=replace(
             descent,
             last_commanded_raw_thrust=thrust,
+            supporting_thrust_commanded_at_s=c.t_s
+            if supports
+            else descent.supporting_thrust_commanded_at_s,
             floor_detected_at_s=floor_detected_at_s,
             climb_rate_change_not_yet_measured_mps=climb_rate_change_not_yet_measured_mps,
             climb_rate_measured_at_s=measured_s,
@@ -285,15 +293,14 @@ def _last_measured_climb_mps(c: Context) -> float:
     return 0.0 if held else c.belief.climb_mps
 
 
-def _find_floor_detection_time_s(
-    c: Context, hover_thrust: float, height_m: float, *, is_sinking: bool
-) -> float | None:
+def _find_floor_detection_time_s(c: Context, height_m: float, measured_mps: float) -> float | None:
     """Return the time at which the floor was first detected; None if it was not.
 
     The floor is detected by an impact from below while the vehicle was sinking and its height above
-    the ground (`height_m`) was less than `MAX_FLOOR_IMPACT_HEIGHT_M`; or by pictures that show no
-    motion, clearly below the target, at a thrust too low compared with `hover_thrust` to support
-    the vehicle. `is_sinking`: the measured speed shows a descent.
+    the ground (`height_m`) was less than `MAX_FLOOR_IMPACT_HEIGHT_M`; or by pictures in which the
+    vehicle does not sink (`measured_mps`), clearly below the target, although its thrust has been
+    too low to support it for `SEEN_STANDING_DWELL_S`. A shorter time is not enough: a small thrust
+    also brakes a climb.
     """
     descent, b, seen = c.state.descent, c.belief, _visual_motion_if_telemetry_old(c)
     if descent.floor_detected_at_s is not None:
@@ -302,16 +309,11 @@ def _find_floor_detection_time_s(
         c.t_s - b.imu.last_impact_or_bounce_at_s < TOUCHDOWN_THRUST_DURATION_S
         and b.dead_reckoning.climb_before_impact_mps < 0.0
     )
-    weak = (
-        0.0
-        < descent.last_commanded_raw_thrust
-        < MAX_THRUST_TO_HOVER_RATIO_IF_SEEN_STANDING * hover_thrust
-    )
     stands = (
         seen is not None
         and seen.gear_to_target_level_m[2] > MIN_SEEN_GEAR_BELOW_TARGET_IF_DETACHED_M
-        and weak
-        and not is_sinking
+        and c.t_s - descent.supporting_thrust_commanded_at_s >= SEEN_STANDING_DWELL_S
+        and measured_mps > -MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS
     )
     return c.t_s if stands or (struck and height_m < MAX_FLOOR_IMPACT_HEIGHT_M) else None
 

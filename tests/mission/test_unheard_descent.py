@@ -144,12 +144,15 @@ def come_down(
     )
     felt = VisualInertialMotion(heard.t_s, (0.0, 0.0), (0.0, 0.0), None) if proven else None
     look: Callable[[Observation], Observation] = Felt()
-    past: list[tuple[float, float]] = [(vehicle.x_m, vehicle.z_m)] * round(PICTURES_LATE_S / TICK_S)
+    late = round(PICTURES_LATE_S / TICK_S)
+    past: list[tuple[float, float]] = [
+        (vehicle.x_m, vehicle.z_m - vehicle.climb_mps * TICK_S * i) for i in range(late, 0, -1)
+    ]
     commands: list[Command] = []
     for i in range(round(lasts_s / TICK_S)):
         t_s = BEGIN_S + TICK_S * i
         past.append((vehicle.x_m, vehicle.z_m))
-        x_m, z_m = past[-1 - round(PICTURES_LATE_S / TICK_S)]
+        x_m, z_m = past[-1 - late]
         now = seen(TICK_S * i)
         target = target_at(
             t_s,
@@ -180,6 +183,22 @@ def test_it_comes_down_softly_whatever_its_motors_give(strength: float, climb_mp
     """By the last telemetry it stands still in the air, and its hover thrust is wrong by 5 %."""
     vehicle = Falling(CEILING_M - 0.8, climb_mps, strength)
     come_down(vehicle, 12.0)
+    assert vehicle.touched_mps is not None
+    assert -0.75 < vehicle.touched_mps < 0.0
+
+
+@pytest.mark.parametrize("strength", [0.95, 1.0, 1.05])
+@pytest.mark.parametrize("climb_mps", [0.2, 0.4, 0.5, 0.6])
+def test_a_climb_in_the_pictures_is_braked_and_is_no_floor(
+    climb_mps: float, strength: float
+) -> None:
+    """The small thrust that brakes it, and the moment in which the vehicle turns round, looked like
+    a vehicle on the floor: it dropped from 0.45 m (seed 2612015017)."""
+    vehicle = Falling(0.45, climb_mps, strength)
+    climbed = watched((0.0, 0.0, CEILING_M), (0.0, 0.0, climb_mps), 30.0)
+    below_m = CEILING_M - vehicle.z_m - BY_TARGET.vehicle.gear_body_m[2]
+    rises = replace(climbed, t_s=BEGIN_S - TICK_S, gear_to_target_level_m=(0.0, 0.0, below_m))
+    come_down(vehicle, 6.0, visual_motion=rises)
     assert vehicle.touched_mps is not None
     assert -0.75 < vehicle.touched_mps < 0.0
 
