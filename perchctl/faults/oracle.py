@@ -50,6 +50,12 @@ FALL_CAUGHT_MPS = 0.05
 SLOW_AGAIN_S = 0.3
 """A fall also ends once the sink rate has been below `FAST_MPS` for this time, s. Larger: the
 descent that follows counts as part of the fall."""
+USUAL_THRUST_RESERVE = 0.165
+"""Thrust reserve of a vehicle of 42 g with the motors of the data sheet. Larger: deeper falls of
+ordinary vehicles are accepted."""
+LEAST_THRUST_RESERVE = 0.05
+"""Smallest thrust reserve with which a vehicle can catch itself at all. Smaller: a vehicle that can
+hardly fly may fall to the floor."""
 FROM_HANGING_S = 1.0
 PRESSED_S, RELEASED_S = 4.0, 0.2
 """A vehicle that bounces off the ceiling for less than `RELEASED_S` still counts as pressing."""
@@ -98,6 +104,7 @@ class Sample(NamedTuple):
     locked: bool
     supervisor_ended: bool  # the supervisor has detected a crash or tumble
     horizontal_mps: float = 0.0
+    thrust_reserve: float = math.inf  # largest thrust divided by the weight, minus 1
     uplink: bool = True  # True if a packet from the program would arrive
     # distance from where the vehicle should be, minus the drift that the fault may cause
     astray_m: float = 0.0
@@ -107,12 +114,15 @@ class Sample(NamedTuple):
     telemetry_ok: bool = True  # telemetry arrives in time and is correct
 
 
-def drop_limit_m(hold_ratio: float) -> float:
+def drop_limit_m(hold_ratio: float, thrust_reserve: float = math.inf) -> float:
     """The depth, m, to which the vehicle may fall after slipping off the magnet. `hold_ratio` is
-    the magnet's holding force divided by the weight."""
-    if hold_ratio <= 0.3:
-        return 0.15
-    return 0.6 if hold_ratio <= 0.75 else 1.0
+    the magnet's holding force divided by the weight, and `thrust_reserve` the largest thrust
+    divided by the weight, minus 1: the distance in which a fall is braked is inversely proportional
+    to it. With less than `USUAL_THRUST_RESERVE`, the vehicle may therefore fall deeper."""
+    limit_m = 1.0
+    if hold_ratio <= 0.75:
+        limit_m = 0.6 if hold_ratio > 0.3 else 0.15
+    return limit_m * max(1.0, USUAL_THRUST_RESERVE / max(thrust_reserve, LEAST_THRUST_RESERVE))
 
 
 def emergency_stop_s(presses_s: Sequence[float]) -> float | None:
@@ -150,11 +160,10 @@ class _Lasting:
 
 @dataclass
 class _Fall:
-    """A fall in progress. `slip_ratio`: the magnet's holding force divided by the weight; None if
-    the fall is not a slip off the magnet."""
+    """A fall in progress. `limit_m`: how deep it may become after a slip off the magnet."""
 
     top_m: float
-    slip_ratio: float | None = None
+    limit_m: float = math.inf
     slow: _Lasting = field(default_factory=lambda: _Lasting(SLOW_AGAIN_S))
 
 
@@ -264,13 +273,13 @@ class Oracle:
                 return
             self._fall = _Fall(self._calm_height_m)
             if self._hung is not None and self._from_hanging(s):
-                self._fall = _Fall(self._hung.height_m, self._hung.hold_ratio)
+                limit_m = drop_limit_m(self._hung.hold_ratio, s.thrust_reserve)
+                self._fall = _Fall(self._hung.height_m, limit_m)
         fall = self._fall
         drop_m = fall.top_m - s.height_m
         self.drop_m = max(self.drop_m, drop_m)
         unpowered = s.t_s - self._weak_s <= FROM_HANGING_S
-        too_deep = fall.slip_ratio is not None and drop_m > drop_limit_m(fall.slip_ratio)
-        if unpowered and (too_deep or s.on_floor):
+        if unpowered and (drop_m > fall.limit_m or s.on_floor):
             self._raise("fell", s.t_s)
         slow_again = fall.slow.update(sinking < FAST_MPS, s.t_s)
         caught = sinking < FALL_CAUGHT_MPS or slow_again

@@ -60,10 +60,11 @@ def true_sample(vehicle: SimulatedVehicle) -> Sample:
     target_z_m = vehicle.scenario.ceiling_z_m + vehicle.scenario.target_above_ceiling_m
     ceiling_n, floor = world.push_n_and_on_floor()
     motors_on = max(firmware.motors) > 0.0
-    lift_n = sum(world.powertrain.forces_n)
+    lift_n = world.powertrain.steady_lift_n
     pushing = motors_on and (
         firmware.controller.thrust >= MAX_RAW_THRUST or lift_n >= PRESSING_WEIGHT_RATIO * weight_n
     )
+    reserve = world.powertrain.max_balanced_thrust_n() / weight_n - 1.0
     supervisor = firmware.supervisor
     fx, fy, fz = world.fx_mps2, world.fy_mps2, world.fz_mps2
     return Sample(
@@ -82,6 +83,7 @@ def true_sample(vehicle: SimulatedVehicle) -> Sample:
         bool(firmware.supervisor_info & LOCKED),
         supervisor.crashed or supervisor.tumbled,
         math.hypot(world.vx_mps, world.vy_mps),
+        thrust_reserve=reserve,
         miss_m=world.gear_miss_m(),
         below_m=target_z_m - world.gear_tip_m()[2],
     )

@@ -210,6 +210,7 @@ class Powertrain:
             scenario.cell_knee,
         )
         self.forces_n = (0.0, 0.0, 0.0, 0.0)
+        self.steady_lift_n = 0.0  # sum of the thrusts without their fluctuation
         self.strength = scenario.motor_strength  # each motor's thrust relative to the curve
         self._fluctuation = Fluctuation(scenario) if scenario.thrust_noise else None
         self._speeds_v = [0.0] * 4  # each motor's speed, as the voltage that would sustain it
@@ -231,6 +232,7 @@ class Powertrain:
             self._speeds_v[motor] = speed_v + share * missing_v
         s1, s2, s3, s4 = self.strength
         f1, f2, f3, f4 = map(self._thrust_n, self._speeds_v)
+        self.steady_lift_n = s1 * f1 + s2 * f2 + s3 * f3 + s4 * f4
         if self._fluctuation is not None:
             n1, n2, n3, n4 = self._fluctuation.step()
             s1, s2, s3, s4 = s1 + n1, s2 + n2, s3 + n3, s4 + n4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -135,9 +136,11 @@ def test_touchdown(sink_mps: float, aside_mps: float, flags: set[str]) -> None:
     assert script.flags == flags
 
 
-def slip(ratio: float, acc: float, fall_s: float, brake_s: float = 0.2) -> Oracle:
+def slip(
+    ratio: float, acc: float, fall_s: float, brake_s: float = 0.2, reserve: float = math.inf
+) -> Oracle:
     script = Script((HANGING._replace(hold_ratio=ratio), 1.0))
-    dropped = STILL_FALL._replace(acc_g=1.0 - acc / G, motors_on=acc < G)
+    dropped = STILL_FALL._replace(acc_g=1.0 - acc / G, motors_on=acc < G, thrust_reserve=reserve)
     script.sink(dropped, falling(acc, fall_s))
     fast = acc * fall_s
     low_m = 2.0 - 0.5 * acc * fall_s**2
@@ -154,6 +157,16 @@ def test_a_slip_is_a_fall_where_it_is_too_deep_for_what_the_magnet_held() -> Non
     assert set(slip(1.0, G, 0.45).flags) == {"fell"}
     limits = [drop_limit_m(r) for r in (0.2, 0.3, 0.5, 0.75, 0.9, 1.1)]
     assert limits == [0.15, 0.15, 0.6, 0.6, 1.0, 1.0]
+
+
+def test_a_vehicle_with_little_thrust_to_spare_may_fall_deeper() -> None:
+    """It brakes in a distance that is inversely proportional to its reserve."""
+    usual_m = drop_limit_m(1.0)
+    assert [drop_limit_m(1.0, reserve) for reserve in (1.0, 0.165)] == [usual_m] * 2
+    assert drop_limit_m(1.0, 0.11) == pytest.approx(1.5 * usual_m)
+    assert drop_limit_m(1.0, 0.05) == drop_limit_m(1.0, -0.2) == pytest.approx(3.3 * usual_m)
+    assert set(slip(1.0, G, 0.45, reserve=0.3).flags) == {"fell"}  # 1.4 m
+    assert slip(1.0, G, 0.45, reserve=0.11).flags == {}
 
 
 @pytest.mark.parametrize(

@@ -70,6 +70,20 @@ def test_the_largest_raw_thrust_presses_at_any_mass(
     assert true_sample(heavy).pressing is pressing
 
 
+@pytest.mark.parametrize(
+    ("scenario", "reserve"),
+    [
+        (SCENARIO, 0.165),  # USUAL_THRUST_RESERVE
+        (replace(SCENARIO, motor_strength=(0.94, 1.0, 1.0, 1.1)), 1.165 * 0.94 - 1.0),
+    ],
+)
+def test_a_sample_tells_the_thrust_reserve_of_the_weakest_motor(
+    scenario: Scenario, reserve: float
+) -> None:
+    sample = true_sample(WatchedVehicle(replace(scenario, mass_kg=0.042), CAMERA, TargetConfig()))
+    assert sample.thrust_reserve == pytest.approx(reserve, abs=0.002)
+
+
 def test_a_sample_tells_how_far_the_gear_is_from_the_target(vehicle: WatchedVehicle) -> None:
     x_m, y_m = vehicle.world.magnet.target_xy_m
     vehicle.world.set_pose((x_m + 0.04, y_m, 1.0), velocity_mps=(0.3, -0.4, 9.0))

@@ -4,6 +4,7 @@ old, slow when cold."""
 
 from __future__ import annotations
 
+import statistics
 from dataclasses import replace
 
 import pytest
@@ -97,3 +98,14 @@ def test_most_thrust_is_what_full_duty_gives(
     assert powertrain.max_balanced_thrust_n() == pytest.approx(most_n, rel=0.01)
     powertrain.strength = strength
     assert powertrain.max_balanced_thrust_n() == pytest.approx(most_n, rel=0.01)
+
+
+def test_the_steady_lift_is_the_lift_without_its_fluctuation() -> None:
+    powertrain = Powertrain(replace(Scenario(), thrust_noise=0.05))
+    lifts_n = []
+    for _ in range(2000):
+        powertrain.step((40000.0,) * 4)
+        lifts_n.append((sum(powertrain.forces_n), powertrain.steady_lift_n))
+    noisy_n, steady_n = (list(lift_n) for lift_n in zip(*lifts_n[1000:], strict=True))
+    assert statistics.fmean(noisy_n) == pytest.approx(statistics.fmean(steady_n), rel=0.01)
+    assert statistics.pstdev(steady_n) < 0.1 * statistics.pstdev(noisy_n)
