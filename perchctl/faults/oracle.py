@@ -193,6 +193,7 @@ class Oracle:
         self._pressed = _Lasting(PRESSED_S)
         self._calm_height_m = 0.0  # height when the vehicle was last not sinking fast
         self._fall: _Fall | None = None
+        self._hops = False  # a blow has thrown it off the floor while its motors were off
         self._weak_s = -math.inf  # last time at which the thrust was too small to slow the fall
         self._before: Sample | None = None
         self._least_up_z = 1.0
@@ -289,9 +290,12 @@ class Oracle:
 
     def _watch_touchdown(self, s: Sample) -> None:
         """Judge a touchdown by the sample before it, because the floor has already reduced the
-        speed in the sample after it."""
+        speed in the sample after it. A vehicle that a blow throws off the floor while its motors
+        are off has not flown."""
         before = self._before
-        if before is None or before.on_floor or not s.on_floor:
+        if before is not None and before.on_floor and not s.on_floor:
+            self._hops = not (before.motors_on or s.motors_on)
+        if before is None or before.on_floor or not s.on_floor or self._hops:
             return
         if -before.vz_mps > TOUCHDOWN_MPS:
             self._raise("fell", s.t_s)

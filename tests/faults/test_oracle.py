@@ -136,6 +136,15 @@ def test_touchdown(sink_mps: float, aside_mps: float, flags: set[str]) -> None:
     assert script.flags == flags
 
 
+@pytest.mark.parametrize("motors_on", [False, True])
+def test_a_blow_to_a_vehicle_that_stands_is_no_touchdown(motors_on: bool) -> None:
+    """Its motors are off: nothing that the program did threw it off the floor (seed 2612011136)."""
+    stands = FLOOR._replace(motors_on=motors_on)
+    thrown = HOVER._replace(height_m=0.005, horizontal_mps=0.9, motors_on=motors_on, acc_g=1.0)
+    script = Script((stands, 1.0)).show(thrown, 0.1).show(stands, 1.0)
+    assert script.flags == ({"slid"} if motors_on else set())
+
+
 def slip(
     ratio: float, acc: float, fall_s: float, brake_s: float = 0.2, reserve: float = math.inf
 ) -> Oracle:
