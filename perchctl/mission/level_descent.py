@@ -165,12 +165,6 @@ def _climb_rate_measured_at_s(c: Context) -> float:
     return c.telemetry.t_s if seen is None else seen.t_s - VISUAL_VELOCITY_TIME_CONSTANT_S
 
 
-def _is_climb_rate_unknown(c: Context) -> bool:
-    """True if neither telemetry nor pictures have measured the vertical speed within the last
-    `hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S`."""
-    return _climb_rate_measurement_age_s(c) > hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S
-
-
 def _clamped_time_since_last_tick_s(c: Context) -> float:
     """Return the time since the previous tick, s, at most `MAX_THRUST_RAMP_INTEGRATION_STEP_S`."""
     return max(0.0, min(MAX_THRUST_RAMP_INTEGRATION_STEP_S, c.t_s - c.state.t_s))
@@ -182,18 +176,17 @@ def _climb_rate_measurement_age_s(c: Context) -> float:
 
 
 def should_wait_for_climb_rate(c: Context) -> bool:
-    """True if, before the first command of raw thrust, neither climb rate nor hover thrust is known
-    well enough for a descent by raw thrust; in that case, the vehicle descends by setpoints, for at
-    most `MAX_DURATION_OF_DESCENT_BY_SETPOINTS_S`."""
+    """True if, before the first command of raw thrust, the telemetry is old and the hover thrust is
+    not known well enough for a descent by raw thrust; in that case, the vehicle descends by
+    setpoints, for at most `MAX_DURATION_OF_DESCENT_BY_SETPOINTS_S`. A climb rate from pictures is
+    no substitute: it is a quarter of a second late, in which a vehicle with 15 % too little thrust
+    gains 0.4 m/s."""
     begins_rough = (
         c.state.descent.last_commanded_raw_thrust == 0.0
         and c.belief.hover_thrust_estimate.is_imprecise
     )
-    return (
-        _is_climb_rate_unknown(c)
-        and begins_rough
-        and c.time_in_phase_s < MAX_DURATION_OF_DESCENT_BY_SETPOINTS_S
-    )
+    is_old = c.t_s - c.telemetry.t_s > hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S
+    return is_old and begins_rough and c.time_in_phase_s < MAX_DURATION_OF_DESCENT_BY_SETPOINTS_S
 
 
 def descend_level_by_raw_thrust(c: Context) -> Action:
