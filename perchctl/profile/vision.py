@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from perchctl.extensions import PATTERN
@@ -198,6 +199,24 @@ class MarkerConfig(Section):
         check_marker_id(self.dictionary, self.id)
         return self
 
+    @property
+    def bits(self) -> NDArray[np.uint8]:
+        """The cells inside the black border (n, n), 1 = white, row 0 at the top of the print."""
+        source = aruco_dictionary(self.dictionary)
+        rows = np.ascontiguousarray(source.bytesList[self.id : self.id + 1])
+        return np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(rows, source.markerSize))
+
+
+_MIN_RING_TO_LARGE_SIDE_RATIO = 1 / 150
+"""Smallest width of the white ring around the small marker, relative to the large marker's side: 1
+mm on a 150 mm marker. Without a ring, the small marker is never found (measured for ids whose
+centre is black)."""
+_UNSAMPLED_CELL_MARGIN = 0.13
+"""Margin along each side of a cell that cv2.aruco does not sample, as a fraction of the cell."""
+_MAX_WHITE_IN_BLACK_CELL = 0.3
+"""Largest share of white that the small marker and its ring may add to the sampled part of a black
+cell of the large one."""
+
 
 FARTHEST_IN_A_ROOM_M = 50.0
 """Largest distance of a target from the origin of a room's positioning, in x or in y, m."""
@@ -271,6 +290,31 @@ class TargetConfig(Section):
                 f"large one ({self.large.side_m} m); sizes are in metres, as printed"
             )
         return self
+
+    @property
+    def ring_m(self) -> float:
+        """Width of the white ring that is printed around the small marker and cut into the large
+        one: one cell of the small marker, or as wide as the large marker's black cells under it
+        allow."""
+        large, small = (np.pad(marker.bits, 1) == 0 for marker in (self.large, self.small))
+        n, half_m = len(large), self.large.side_m / 2.0
+        # The sampled part of each row of cells of the large marker.
+        middle_m = half_m * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
+        reach_m = half_m * (1.0 - 2.0 * _UNSAMPLED_CELL_MARGIN) / n
+
+        def coverage(edges_m: Array) -> Array:
+            ends = np.clip(edges_m, (middle_m - reach_m)[:, None], (middle_m + reach_m)[:, None])
+            return np.diff(ends, axis=1) / (2.0 * reach_m)
+
+        cells = coverage(self.small.side_m * (np.arange(len(small) + 1) / len(small) - 0.5))
+        black = cells @ small @ cells.T
+        least_m = _MIN_RING_TO_LARGE_SIDE_RATIO * self.large.side_m
+        widest_m = max(self.small.side_m / len(small), least_m)
+        for ring_m in np.linspace(widest_m, least_m, 16):
+            hole = coverage((self.small.side_m / 2.0 + ring_m) * np.array([-1.0, 1.0]))
+            if float((hole @ hole.T - black)[large].max()) <= _MAX_WHITE_IN_BLACK_CELL:
+                break
+        return float(ring_m)
 
 
 class DetectorConfig(Section):

@@ -14,27 +14,15 @@ import math
 import re
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.profile import MarkerConfig, TargetConfig, aruco_dictionary
+from perchctl.profile import MarkerConfig, TargetConfig
 
 BORDER_BITS = 1
 """Width of a marker's black border in cells."""
-
-RING_MIN_PER_LARGE_SIDE = 1 / 150
-"""Smallest width of the white ring around the small marker, relative to the large marker's side: 1
-mm on a 150 mm marker. Without a ring, the small marker is never found (measured for ids whose
-centre is black)."""
-
-SAMPLED_MARGIN = 0.13
-"""Margin along each side of a cell that cv2.aruco does not sample, as a fraction of the cell."""
-MAX_WHITE_IN_BLACK_CELL = 0.3
-"""Largest share of white that the small marker and its ring may add to a black cell of the large
-one."""
 
 
 @dataclass(frozen=True)
@@ -93,10 +81,7 @@ class TargetDrawing:
 
 def marker_cells(marker: MarkerConfig) -> NDArray[np.bool_]:
     """A mask (n, n) of the black cells of a marker with its border, row 0 at the top."""
-    dictionary = aruco_dictionary(marker.dictionary)
-    n = int(dictionary.markerSize) + 2 * BORDER_BITS
-    picture = cv2.aruco.generateImageMarker(dictionary, marker.id, n, borderBits=BORDER_BITS)
-    return np.asarray(picture) < 128
+    return np.asarray(np.pad(marker.bits, BORDER_BITS) == 0)
 
 
 def marker_corners_m(side_m: float) -> Array:
@@ -108,22 +93,16 @@ def marker_corners_m(side_m: float) -> Array:
 def draw_target(target: TargetConfig) -> TargetDrawing:
     """The drawing of both markers; sizes are taken from the configuration.
 
-    The white ring is one cell of the small marker wide, or as wide as the large marker's black
-    cells under it allow. If the centre of the large marker is already white (id 997 of
-    DICT_4X4_1000), the ring changes nothing. With a 4x4 dictionary, any two ids stay readable if
-    the small side is at most 0.18 of the large one.
+    If the centre of the large marker is already white (id 997 of DICT_4X4_1000), the white ring
+    changes nothing. With a 4x4 dictionary, any two ids stay readable if the small side is at most
+    0.18 of the large one.
     """
-    large = marker_cells(target.large)
-    small = marker_cells(target.small)
-    large_side = target.large.side_m
-    small_side = target.small.side_m
-    least = RING_MIN_PER_LARGE_SIDE * large_side
-    for ring in np.linspace(max(small_side / len(small), least), least, 16):
-        edges, black = _nested(large, small, large_side, small_side, float(ring))
-        if _white_in_black_cells(large, large_side, edges, black) <= MAX_WHITE_IN_BLACK_CELL:
-            break
-    sheet = large_side + 2.0 * large_side / len(large)
-    return TargetDrawing(edges, black, large_side, small_side, sheet, float(ring))
+    large, small = target.large, target.small
+    edges, black = _nested(
+        marker_cells(large), marker_cells(small), large.side_m, small.side_m, target.ring_m
+    )
+    sheet = large.side_m + 2.0 * large.side_m / len(marker_cells(large))
+    return TargetDrawing(edges, black, large.side_m, small.side_m, sheet, target.ring_m)
 
 
 def _nested(
@@ -143,16 +122,6 @@ def _nested(
     black &= ~((np.abs(xs) < hole) & (np.abs(ys) < hole))
     black |= _lookup(small, small_side_m, xs, ys)
     return edges, black
-
-
-def _white_in_black_cells(
-    large: NDArray[np.bool_], large_side_m: float, edges_m: Array, black: NDArray[np.bool_]
-) -> float:
-    """The largest share of white in the sampled part of a black cell, 0..1."""
-    n = len(large)
-    w = pixel_overlap(edges_m, n / large_side_m, n, 1.0 - 2.0 * SAMPLED_MARGIN)
-    ink = w @ black.astype(np.float64) @ w.T
-    return float((1.0 - ink)[large].max())
 
 
 def _merged(edges_m: Array) -> Array:

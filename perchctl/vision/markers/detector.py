@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
+from perchctl.profile import DetectorConfig, TargetConfig
 from perchctl.vision.markers.corners import scale_square
 from perchctl.vision.markers.pattern import (
     MarkerPattern,
@@ -70,7 +70,7 @@ def make_detector_setup(
 ) -> DetectorSetup:
     """Return the setup for a target, with dictionaries that only contain the target's markers.
     `static_hidden_mask` (h, w) is True for pixels that the vehicle covers in every image."""
-    large_bits, small_bits = _marker_bits(target.large), _marker_bits(target.small)
+    large_bits, small_bits = target.large.bits, target.small.bits
     small_to_large_side_ratio = target.small.side_m / target.large.side_m
     return DetectorSetup(
         large_and_small_aruco_dictionaries=(
@@ -82,7 +82,12 @@ def make_detector_setup(
                 make_cells_along_border(
                     large_bits, _PRINT_EDGE_SIGMA_M * (len(large_bits) + 2) / target.large.side_m
                 ),
-                make_marker_drawing(large_bits, small_bits, small_to_large_side_ratio),
+                make_marker_drawing(
+                    large_bits,
+                    small_bits,
+                    small_to_large_side_ratio,
+                    small_to_large_side_ratio + 2.0 * target.ring_m / target.large.side_m,
+                ),
             ),
             "small": make_marker_pattern(
                 make_cells_along_border(
@@ -122,13 +127,6 @@ def make_quad_detector(setup: DetectorSetup) -> Any:
     parameters.adaptiveThreshWinSizeStep = most_px - least_px
     parameters.minMarkerPerimeterRate = _LOOSE_MIN_PERIMETER_RATE
     return cv2.aruco.ArucoDetector(list(setup.large_and_small_aruco_dictionaries), parameters)
-
-
-def _marker_bits(marker: MarkerConfig) -> NDArray[np.uint8]:
-    """Return the inner bits (n, n) of a marker in the profile, 1 = white."""
-    source = aruco_dictionary(marker.dictionary)
-    rows = np.ascontiguousarray(source.bytesList[marker.id : marker.id + 1])
-    return np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(rows, source.markerSize))
 
 
 def _make_dictionary(bits: NDArray[np.uint8], max_correction_bits: int) -> Any:

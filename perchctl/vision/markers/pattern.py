@@ -260,12 +260,15 @@ class MarkerDrawing:
 
     The drawing of the large marker also contains the small marker: `small_marker_cell_whiteness`
     are the cells of the small marker, and `small_to_large_side_ratio` is its side divided by the
-    side of the large marker. `paper_reach_half_sides` is half the side of the paper in the marker's
-    coordinates; None if the paper is assumed to be infinite."""
+    side of the large marker. Nothing of the large marker is printed up to `ring_reach_half_sides`
+    from the centre, the outer edge of the white ring around the small marker.
+    `paper_reach_half_sides` is half the side of the paper in the marker's coordinates; None if the
+    paper is assumed to be infinite."""
 
     cell_whiteness: Array
     small_marker_cell_whiteness: Array | None = None
     small_to_large_side_ratio: float = 0.0
+    ring_reach_half_sides: float = 0.0
     paper_reach_half_sides: float | None = None
 
     @property
@@ -279,11 +282,13 @@ def make_marker_drawing(
     bits: NDArray[np.uint8],
     small_marker_bits: NDArray[np.uint8] | None = None,
     small_to_large_side_ratio: float = 0.0,
+    ring_reach_half_sides: float = 0.0,
 ) -> MarkerDrawing:
     """Return the drawing of a marker with inner bits `bits` (n, n), 1 = white, to which a black
-    border is added. `small_marker_bits` (m, m) and `small_to_large_side_ratio`, the side of the
-    small marker divided by the side of the large one, describe the small marker in its centre, if
-    any; the paper then ends one cell outside the border."""
+    border is added. `small_marker_bits` (m, m), `small_to_large_side_ratio`, the side of the small
+    marker divided by the side of the large one, and `ring_reach_half_sides`, the distance of the
+    outer edge of its white ring from the centre, in half sides of the large marker, describe the
+    small marker in its centre, if any; the paper then ends one cell outside the border."""
     cells = np.pad(bits.astype(np.float64), 1)
     if small_marker_bits is None:
         return MarkerDrawing(cells)
@@ -291,6 +296,7 @@ def make_marker_drawing(
         cells,
         np.pad(small_marker_bits.astype(np.float64), 1),
         small_to_large_side_ratio,
+        max(ring_reach_half_sides, small_to_large_side_ratio),
         1.0 + 2.0 / len(cells),
     )
 
@@ -300,12 +306,15 @@ def _cell_coverage(
     node_reach_half_sides: float,
     cells_per_side: int,
     square_reach_half_sides: float,
+    covered_reach_half_sides: float = math.inf,
 ) -> Array:
     """Return the fraction of each node's interval that each cell covers, (nodes, cells), along one
     axis. A node's interval extends `node_reach_half_sides` to each side of its position. The
     `cells_per_side` cells fill the interval from -square_reach_half_sides to
-    square_reach_half_sides. Lengths are in half sides from the marker's centre."""
+    square_reach_half_sides; of each cell, only the part up to `covered_reach_half_sides` from the
+    centre counts. Lengths are in half sides from the marker's centre."""
     edges = square_reach_half_sides * np.linspace(-1.0, 1.0, cells_per_side + 1)
+    edges = np.clip(edges, -covered_reach_half_sides, covered_reach_half_sides)
     low, high = (
         node_positions_half_sides[:, None] - node_reach_half_sides,
         node_positions_half_sides[:, None] + node_reach_half_sides,
@@ -377,6 +386,15 @@ def render_cells(
     C = _cell_coverage(wide, node_reach_half_sides, len(drawing.cell_whiteness), 1.0)
     black = C @ (1.0 - drawing.cell_whiteness) @ C.T
     if drawing.small_marker_cell_whiteness is not None:
+        # The part of the large marker that the small one and its ring replace.
+        C = _cell_coverage(
+            wide,
+            node_reach_half_sides,
+            len(drawing.cell_whiteness),
+            1.0,
+            drawing.ring_reach_half_sides,
+        )
+        black -= C @ (1.0 - drawing.cell_whiteness) @ C.T
         C = _cell_coverage(
             wide,
             node_reach_half_sides,

@@ -5,8 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from perchctl.geometry import make_T
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
+from perchctl.sim import Renderer, Scenario
+from perchctl.target import draw_target
 from perchctl.vision import project, square_corners
 from perchctl.vision.markers import detect
 from perchctl.vision.markers.detect import (
@@ -18,6 +22,7 @@ from perchctl.vision.markers.detect import (
     refine_expected_markers,
 )
 from perchctl.vision.markers.detector import DetectorInput, make_detector_setup
+from perchctl.vision.markers.pattern import BLUR_MARGIN_NODES, render_cells
 from perchctl.vision.markers.search import nesting_error_to_tolerance_ratio
 from perchctl.vision.types import Detection, Detections
 from tests.helpers.corner_views import VIEWS, View, findings
@@ -187,3 +192,56 @@ def test_without_its_row_a_method_is_missed(view: View, monkeypatch: pytest.Monk
     monkeypatch.setattr(detect, "CORNER_METHODS", rest)
     without = find_corners(view.picture, view.prior).corners.get(view.marker)
     assert without is None or not np.array_equal(without.corners_px, with_it.corners_px)
+
+
+# --- Other ids than the default ones ------------------------------------------------------------
+
+
+def target_with(large_id: int, small_id: int = 254) -> TargetConfig:
+    return TargetConfig(
+        large=MarkerConfig(dictionary="DICT_4X4_1000", id=large_id, side_m=0.150),
+        small=MarkerConfig(dictionary="DICT_ARUCO_ORIGINAL", id=small_id, side_m=0.025),
+    )
+
+
+def from_the_floor(target: TargetConfig, number: int) -> NDArray[np.uint8]:
+    """What a camera on the floor sees of the target, 2.3 m above it."""
+    scenario = Scenario(
+        ceiling_z_m=2.3, target_xy_m=(0.1, 0.1), target_yaw_rad=0.7 * number, seed=number
+    )
+    renderer = Renderer(scenario, CAMERA, target)
+    return renderer.render([make_T(np.eye(3), (0.0, 0.0, 0.0))], frame_index=number)
+
+
+@pytest.mark.parametrize("large_id", [997, 145, 300, 10])
+def test_a_marker_is_fitted_as_it_is_printed(large_id: int) -> None:
+    """Whatever colour its centre has, under the small marker and its ring."""
+    target = target_with(large_id)
+    drawing = make_detector_setup(DetectorConfig(), target).patterns["large"].drawing
+    n = 240
+    axis = (2.0 * np.arange(n) + 1.0) / n - 1.0
+    inner = slice(BLUR_MARGIN_NODES, -BLUR_MARGIN_NODES)
+    white = render_cells(drawing, axis, 1.0 / n)[inner, inner]
+    printed = 1.0 - draw_target(target).ink_coverage(n / target.large.side_m, n)
+    assert np.abs(white - printed).max() < 1e-5
+
+
+def test_targets_are_found_from_the_floor_whatever_their_ids() -> None:
+    """And none is taken for the one whose codeword is nearest."""
+    bits = [target_with(i).large.bits for i in range(1000)]
+    found, taken = [], 0
+    for large_id in range(0, 1000, 33):
+        target = target_with(large_id)
+        setup = make_detector_setup(DetectorConfig(), target)
+
+        def cells_apart(i: int, own: int = large_id) -> int:
+            return min(int((np.rot90(bits[i], k) != bits[own]).sum()) for k in range(4))
+
+        near = min((i for i in range(1000) if i != large_id), key=cells_apart)
+        for number in range(2):
+            image = from_the_floor(target, number)
+            found.append(detect_markers(frame(image), None, setup, CAMERA).large is not None)
+        other = from_the_floor(target_with(near), 0)
+        taken += bool(detect_markers(frame(other), None, setup, CAMERA).markers)
+    assert np.mean(found) > 0.9
+    assert taken == 0
