@@ -174,7 +174,7 @@ def _focus(rehearsal: Rehearsal, profile: Profile) -> Finding:
 
 def _target_in_view(rehearsal: Rehearsal, profile: Profile) -> Finding:
     if not rehearsal.target_pictures:
-        return skipped("not in view", "put the vehicle under the target to check the other rows")
+        return skipped("not detected", "put the vehicle under the target to check the other rows")
     found = f"seen in {100 * rehearsal.target_pictures // rehearsal.pictures} % of the pictures"
     target = rehearsal.target
     if target is not None:
@@ -215,7 +215,7 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Fin
     if not rehearsal.target_pictures:
         where = overhead_text(profile.target, camera, profile.camera.mount)
         return failed(
-            "the target is not in view, so perchctl fly would refuse to take off",
+            "the target is not detected, so perchctl fly would refuse to take off",
             f"put the vehicle under the target: {where}",
         )
     if rehearsal.target is None:

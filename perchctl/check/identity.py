@@ -9,8 +9,8 @@ target   its camera sees its target at the position expected from this home
 
 The vehicle, its rigid body and the target in its camera's view are each compared with the home, so
 none of them can belong to another vehicle. If another vehicle's camera would show the same image,
-or if the target is not in view, perchctl asks the user to cover the lens, and identifies the camera
-whose image goes dark. No vehicle is armed, and the motors stay off.
+or if the target is not detected, perchctl asks the user to cover the lens, and identifies the
+camera whose image goes dark. No vehicle is armed, and the motors stay off.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from perchctl.errors import ConnectionFailed, PerchError
 from perchctl.flight import FlyOptions, WallClock
 from perchctl.link import ProbeLink
 from perchctl.profile import Profile
-from perchctl.target import overhead_text
+from perchctl.target import overhead_text, view_from
 from perchctl.vehicle import DISARM_IT, FLYING, Telemetry
 from perchctl.vision import CameraModel, make_pipeline
 
@@ -60,8 +60,9 @@ class Stand:
     Attributes:
         home_text: its home in words, in room axes.
         homes: the homes of the other vehicles.
-        views: where the target of each other vehicle would appear to be if its camera were
-            mistaken for this vehicle's.
+        views: where the target of another vehicle would appear to be if that vehicle's camera were
+            mistaken for this one's. Contains only targets that have a marker in common with this
+            vehicle's target: the others are not detected.
         lookalikes: vehicles whose cameras would show a target at the position at which this
             vehicle's own target must appear.
     """
@@ -226,8 +227,16 @@ def _target_finding(view: View, ask: Ask | None) -> Finding:
     assert expected_m is not None, "each vehicle of a fleet has a target position"
     own = view.rehearse()
     place_m = _target_place(own)
-    away_m = math.inf if place_m is None else math.dist(place_m, expected_m)
     # Report a distance beyond the limit even if single images are within it.
+    if place_m is None or math.dist(place_m, expected_m) > target.expected_within_m:
+        anywhere = target.model_copy(update={"expected_xy_m": None})
+        own_or_other = view.profile.model_copy(update={"target": anywhere})
+        place_m = _target_place(view.rehearse(own_or_other))
+    if place_m is None:
+        if ask is not None:
+            return _covered_finding(view, own, ask, "its target is not detected")
+        return _undetected_finding(view, expected_m)
+    away_m = math.dist(place_m, expected_m)
     if away_m <= target.expected_within_m:
         found = f"the camera sees the vehicle's target {away_m:.2f} m from its expected position"
         if ask is None or not stand.lookalikes:
@@ -238,24 +247,38 @@ def _target_finding(view: View, ask: Ask | None) -> Finding:
             ask,
             f"{stand.lookalikes[0]}'s camera would see its own target at the same position",
         )
-    anywhere = target.model_copy(update={"expected_xy_m": None})
-    other_m = _target_place(view.rehearse(view.profile.model_copy(update={"target": anywhere})))
-    if other_m is not None:
-        found = (
-            f"the camera sees a target {math.dist(other_m, expected_m):.2f} m from the "
-            "vehicle's own target"
+    found = f"the camera sees a target {away_m:.2f} m from the vehicle's own target"
+    there = _nearest(place_m, stand.views, target.expected_within_m)
+    if there is not None:
+        found += (
+            f", at the position where {there}'s camera would see its own target; the two "
+            "cameras may be swapped"
         )
-        there = _nearest(other_m, stand.views, target.expected_within_m)
-        if there is not None:
-            found += (
-                f", at the position where {there}'s camera would see its own target; the two "
-                "cameras may be swapped"
-            )
-        return failed(found, "correct source, target_m, home_m or heading_deg")
-    if ask is not None:
-        return _covered_finding(view, own, ask, "its target is not in view")
-    where = overhead_text(target, view.calibrated, view.profile.camera.mount)
-    return failed("its target is not in view", f"move home_m closer to the target: {where}")
+    return failed(found, "correct source, target_m, home_m or heading_deg")
+
+
+def _undetected_finding(view: View, expected_m: Point) -> Finding:
+    """Report that the target was not detected, and whether its expected position is in the image
+    under the lowest possible ceiling, which is just above the highest point of the search."""
+    profile, stand = view.profile, view.stand
+    floor_m = profile.safety.ground_z_m
+    sight = view_from(
+        np.array((*stand.home_m, floor_m)),
+        stand.heading_rad,
+        np.array((*expected_m, floor_m + profile.planner.search.max_height_m)),
+        stand.heading_rad,
+        profile.target,
+        view.calibrated,
+        profile.camera.mount,
+    )
+    if sight.has_marker:
+        return failed(
+            "its target is not detected, although its expected position is in the image",
+            "check the light and the focus, and compute the range of its ids with perchctl "
+            "make-target design",
+        )
+    where = overhead_text(profile.target, view.calibrated, profile.camera.mount)
+    return failed("its target is not detected", f"move home_m closer to the target: {where}")
 
 
 def _covered_finding(view: View, before: Rehearsal, ask: Ask, why: str) -> Finding:

@@ -62,7 +62,7 @@ class Rehearsal:
         newest_outputs: the last few pipeline outputs; target_pictures: number of images with a
             target.
         silent_s: time without an image at the end.
-        target: the final estimate; None if the target was not in view.
+        target: the final estimate; None if the target was not detected.
         target_places: time and position of the target, m, in each image in which it was measured
             since the vehicle came to rest.
         prints: the comparison of the two markers' apparent sizes; None for too few frames.

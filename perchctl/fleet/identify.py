@@ -53,6 +53,7 @@ def make_stand(fleet: Fleet, vehicle: FleetVehicle) -> Stand:
         views={
             other.name: flown.to_estimate(_from_home(vehicle, _seen_m(other, other.target_m)))
             for other in others
+            if have_common_marker(other, vehicle)
         },
         lookalikes=tuple(lookalikes),
     )

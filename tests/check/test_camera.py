@@ -128,7 +128,7 @@ def test_a_good_camera_fails_nothing() -> None:
     ("frozen", "pictures", "fail", "is frozen"),
     ("mirrored", "pictures", "fail", "mirrored"),
     ("lossy, and a wrong print", "print", "fail", "print error"),
-    ("bare", "target", "skipped", "not in view"),
+    ("bare", "target", "skipped", "not detected"),
     *(pytest.param(*each, marks=pytest.mark.long) for each in (
         ("snow", "pictures", "fail", "snow"),
         ("dark", "pictures", "fail", "dark"),

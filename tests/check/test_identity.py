@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.check import CheckScope, Row, Stand, Verdict, identity_rows, vehicle
+from perchctl.check import CheckScope, Row, Stand, Verdict, identity, identity_rows, vehicle
+from perchctl.check.rehearsal import Rehearsal
 from perchctl.link.listening import ALL_LEDS, FIRMWARES_LEDS, NO_LEDS
 from perchctl.positioning import BodyPose, CaptureFrame, CaptureSource
 from perchctl.profile import PositioningConfig
@@ -112,6 +115,34 @@ def test_the_camera_of_another_vehicle_is_named(sim: SimProcess, relay: Relay) -
         "from the vehicle's own target, at the position where east's camera would see its own "
         "target; the two cameras may be swapped"
     )
+
+
+@pytest.mark.parametrize(("expected_x_m", "words", "advice"), [
+    (0.1, "its target is not detected, although its expected position is in the image", "its ids"),
+    (5.0, "its target is not detected", "move home_m closer to the target: at most"),
+])  # fmt: skip
+def test_a_target_that_is_not_detected_is_not_called_out_of_view(
+    expected_x_m: float, words: str, advice: str
+) -> None:
+    flown = options("sim://", "sim:", expecting(expected_x_m, 0.0))
+    scope = CheckScope(**(SCOPE | {"rehearse_s": 0.3}))
+    away = replace(flown, sim_target_xy_m=(20.0, 0.0))
+    *_, row = identity_rows(away, STAND, scope, lambda _: pytest.fail("it is simulated"))
+    assert (row.name, row.verdict, row.found) == ("target", Verdict.FAIL, words)
+    assert advice in row.advice
+
+
+def test_a_target_that_some_pictures_show_in_its_place_is_the_own_one(
+    sim: SimProcess, relay: Relay, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is seen at first, and then the target where it is expected."""
+    seen = iter(
+        [Rehearsal(True), Rehearsal(True, target_places=[(1.0, np.array([0.05, 0.0, 2.2]))])]
+    )
+    monkeypatch.setattr(identity, "rehearse", lambda *_: next(seen))
+    stand = Stand(name="north", home_m=(0.0, 0.0), home_text="home", views={"east": (0.05, 0.0)})
+    row = rows_of(relay.uri, sim, stand)["target"]
+    assert (row.verdict, "0.05 m from its expected position" in row.found) == (Verdict.PASS, True)
 
 
 @pytest.mark.parametrize(("covers", "verdict"), [(True, Verdict.PASS), (False, Verdict.FAIL)])

@@ -51,7 +51,7 @@ def test_under_the_target_it_passes() -> None:
 
 
 @pytest.mark.parametrize(("verdict", "words", "advice", "done"), [
-    ("fail", "not in view, so perchctl fly would refuse to take off",
+    ("fail", "not detected, so perchctl fly would refuse to take off",
      "at most 3.2 m above the camera", rehearsed(target_pictures=0, target=None)),
     ("fail", "the vehicle would not see it", "forward", rehearsed(1.3)),
     ("warn", "no longer in view at the end", "lost frames", rehearsed(target=None)),

@@ -53,6 +53,8 @@ def test_a_target_elsewhere_or_with_other_ids_can_be_told_apart(tmp_path: Path) 
     )
     for fleet in (pair(tmp_path, -0.4), pair(tmp_path, 0.2, ids)):
         assert [make_stand(fleet, v).lookalikes for v in fleet.vehicles] == [(), ()]
+    # A target with other ids is not detected, so no camera is mistaken for that of its vehicle.
+    assert [make_stand(fleet, v).views for v in fleet.vehicles] == [{}, {}]
 
 
 def test_a_simulated_fleet_is_identified_without_a_question(tmp_path: Path) -> None:
