@@ -28,7 +28,7 @@ from graphlib import CycleError, TopologicalSorter
 from perchctl.corridor import Corridor
 from perchctl.errors import InvalidValue
 from perchctl.fleet.fleet import Fleet, FleetVehicle
-from perchctl.profile import CorridorConfig, MarkerConfig, Profile
+from perchctl.profile import CorridorConfig, Profile
 
 WANDER_M = 0.3
 """Horizontal distance by which a draught may move a healthy vehicle from its setpoint, m. It is
@@ -333,12 +333,11 @@ def _check_targets(first: FleetVehicle, second: FleetVehicle) -> None:
 
 
 def have_common_marker(one: FleetVehicle, other: FleetVehicle) -> bool:
-    """True if the targets of the two vehicles have a marker in common."""
+    """True if the targets of the two vehicles have a marker in common, by whichever dictionary it
+    is named."""
     ours, theirs = one.profile.target, other.profile.target
-    return not {_marker(ours.large), _marker(ours.small)}.isdisjoint(
-        {_marker(theirs.large), _marker(theirs.small)}
+    return any(
+        own.has_same_pattern(marker)
+        for own in (ours.large, ours.small)
+        for marker in (theirs.large, theirs.small)
     )
-
-
-def _marker(marker: MarkerConfig) -> tuple[str, int]:
-    return marker.dictionary, marker.id

@@ -41,17 +41,6 @@ def dictionary_size(name: str) -> int:
     return int(aruco_dictionary(name).bytesList.shape[0])
 
 
-def have_same_pattern(dictionary: str, marker_id: int, other: str, other_id: int) -> bool:
-    """True if two markers, each given by dictionary and id, have the same cells in some rotation.
-    The first ids of ``DICT_4X4_1000``, for example, are those of ``DICT_4X4_50``."""
-    one, two = aruco_dictionary(dictionary), aruco_dictionary(other)
-    if one.markerSize != two.markerSize:
-        return False
-    turns = two.bytesList[other_id].reshape(4, -1)  # a row for each quarter turn
-    cells = one.bytesList[marker_id].reshape(4, -1)[0]
-    return any(bool((cells == turn).all()) for turn in turns)
-
-
 def check_marker_id(dictionary: str, marker_id: int) -> None:
     """Raise ValueError if the id is not in the dictionary."""
     count = dictionary_size(dictionary)
@@ -206,6 +195,11 @@ class MarkerConfig(Section):
         rows = np.ascontiguousarray(source.bytesList[self.id : self.id + 1])
         return np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(rows, source.markerSize))
 
+    def has_same_pattern(self, other: MarkerConfig) -> bool:
+        """True if both markers have the same cells in some rotation. The first ids of
+        ``DICT_4X4_1000``, for example, are those of ``DICT_4X4_50``."""
+        return any(np.array_equal(np.rot90(self.bits, turn), other.bits) for turn in range(4))
+
 
 _MIN_RING_TO_LARGE_SIDE_RATIO = 1 / 150
 """Smallest width of the white ring around the small marker, relative to the large marker's side: 1
@@ -274,7 +268,7 @@ class TargetConfig(Section):
     @model_validator(mode="after")
     def _markers_differ(self) -> TargetConfig:
         large, small = self.large, self.small
-        if have_same_pattern(large.dictionary, large.id, small.dictionary, small.id):
+        if large.has_same_pattern(small):
             both = dict.fromkeys(f"{m.dictionary}/{m.id}" for m in (large, small))
             raise ValueError(
                 f"large and small are the same marker, {' and '.join(both)}, and cannot be "

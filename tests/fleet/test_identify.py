@@ -57,6 +57,18 @@ def test_a_target_elsewhere_or_with_other_ids_can_be_told_apart(tmp_path: Path) 
     assert [make_stand(fleet, v).views for v in fleet.vehicles] == [{}, {}]
 
 
+def test_ids_of_two_dictionaries_may_name_the_same_marker(tmp_path: Path) -> None:
+    ids = (
+        ", target: {large: {dictionary: DICT_4X4_%d, id: 16, side_m: 0.15}, "
+        "small: {dictionary: DICT_ARUCO_ORIGINAL, id: %d, side_m: 0.025}}"
+    )
+    text = PAIR.replace("target_m: [0.2, 0]", "target_m: [0.2, 0]" + ids % (1000, 5))
+    path = tmp_path / "pair.yaml"
+    path.write_text(text.replace("IDS", ids % (50, 254)).replace("TARGET", "0.2"), encoding="utf-8")
+    fleet = load_fleet(path)
+    assert [make_stand(fleet, v).lookalikes for v in fleet.vehicles] == [("east",), ("north",)]
+
+
 def test_a_simulated_fleet_is_identified_without_a_question(tmp_path: Path) -> None:
     path = tmp_path / "one.yaml"
     path.write_text(ONE.replace("URI", ""), encoding="utf-8")
