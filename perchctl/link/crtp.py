@@ -67,6 +67,10 @@ class Packet(NamedTuple):
 
 LAND_TIMES = 3
 """Number of times that a landing command is sent."""
+NOTIFY_TIMES = 3
+"""Number of notify messages that follow a stop setpoint. Each setpoint makes the firmware wait for
+another one, so if those that follow the last one are lost, it locks the vehicle 2 s later, however
+many were received before."""
 # Port 7: channels, then setpoint types.
 _SETPOINT, _META = 0, 1
 _STOP, _POSITION = 0, 7
@@ -113,7 +117,7 @@ def _packets(what: Command | ExternalPosition) -> tuple[Packet, ...]:
             return (Packet(Port.HIGH_LEVEL, 0, data),) * LAND_TIMES + (_NOTIFY,)
         case StopMotors():
             stop = Packet(Port.COMMANDER_GENERIC, _SETPOINT, bytes((_STOP,)))
-            return stop, _NOTIFY
+            return stop, *(_NOTIFY,) * NOTIFY_TIMES
         case EmergencyStop():
             return (Packet(Port.SUPERVISOR, _REQUEST, bytes((_EMERGENCY_STOP,))),)
         case Arm(armed):

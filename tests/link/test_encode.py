@@ -22,7 +22,14 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.errors import InvalidValue
 from perchctl.link import MockLink, Packet, Radio
 from perchctl.link.connection import send_packets
-from perchctl.link.crtp import LAND_TIMES, MAX_DATA, UNLOCK_THRUST, UNLOCK_TIMES, encode
+from perchctl.link.crtp import (
+    LAND_TIMES,
+    MAX_DATA,
+    NOTIFY_TIMES,
+    UNLOCK_THRUST,
+    UNLOCK_TIMES,
+    encode,
+)
 from perchctl.sim import Scenario, SimulatedVehicle
 from perchctl.sim.crtp import execute_packet
 from perchctl.vehicle import (
@@ -90,7 +97,8 @@ class Recorder:
                 self.commander.send_notify_setpoint_stop()
             case StopMotors():
                 self.commander.send_stop_setpoint()
-                self.commander.send_notify_setpoint_stop()
+                for _ in range(NOTIFY_TIMES):
+                    self.commander.send_notify_setpoint_stop()
             case EmergencyStop():
                 self.supervisor.send_emergency_stop()
             case Arm(armed):
