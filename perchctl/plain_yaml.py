@@ -3,6 +3,7 @@ one)."""
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -93,3 +94,25 @@ def split_values(text: str) -> list[str]:
 def clip_text(text: str, max_length: int = _MOST_SHOWN) -> str:
     """Return the text, truncated to `max_length` characters and then ending in ``...``."""
     return text if len(text) <= max_length else f"{text[: max_length - 3]}..."
+
+
+def value_text(value: Any) -> str:
+    """Return a value that was read from YAML, in the words of YAML rather than Python, truncated
+    for a message."""
+    return clip_text(_flow_text(value))
+
+
+def _flow_text(value: Any) -> str:
+    match value:
+        case None:
+            return "nothing"
+        case bool():
+            return str(value).lower()
+        case list() | tuple():
+            return f"[{', '.join(map(_flow_text, value))}]"
+        case dict():
+            pairs = (f"{name}: {_flow_text(each)}" for name, each in value.items())
+            return f"{{{', '.join(pairs)}}}"
+        case datetime.date():
+            return str(value)
+    return repr(value)

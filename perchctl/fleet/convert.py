@@ -18,13 +18,14 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.errors import InvalidValue
-from perchctl.plain_yaml import clip_text
+from perchctl.plain_yaml import clip_text, value_text
 from perchctl.profile import read_yaml, yaml_scalar
 
 _CAPTURE = (
     "# Name your motion-capture system and its host in defaults. Each vehicle needs its own",
     "# rigid body there: Crazyswarm2 also works with single markers, but perchctl does not.",
 )
+_A_URI = "radio://0/80/2M/E7E7E7E7E7"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,6 +146,8 @@ def _from_cfcli(path: Path, units: Sequence[Any], values: Mapping[str, Any]) -> 
     for number, unit in enumerate(units, 1):
         where = f"{path}: units, number {number}"
         entry = _mapping(where, unit)
+        if entry.get("name") is not None:
+            where += f" ({clip_text(str(entry['name']))})"
         vehicles.append(
             ConvertedVehicle(
                 name=_file_name(_text(entry.get("name"), f"CF-{number:02d}")),
@@ -160,14 +163,16 @@ def _from_cfcli(path: Path, units: Sequence[Any], values: Mapping[str, Any]) -> 
 
 def _mapping(where: str, value: Any) -> Mapping[str, Any]:
     if not isinstance(value, dict):
-        raise InvalidValue(f"{where}: must contain keys and values, found {type(value).__name__}")
+        raise InvalidValue(f"{where}: must have keys and values, found {value_text(value)}")
     return value
 
 
 def _uri(where: str, entry: Mapping[str, Any]) -> str:
     uri = entry.get("uri")
+    if uri is None:
+        raise InvalidValue(f"{where}: uri: is missing; add the vehicle's URI, as in {_A_URI}")
     if not isinstance(uri, str):
-        raise InvalidValue(f"{where}: has no uri")
+        raise InvalidValue(f"{where}: uri: must be text, as in {_A_URI}, found {value_text(uri)}")
     return uri
 
 
@@ -177,7 +182,7 @@ def _place(where: str, value: Any) -> tuple[float, float] | None:
         return None
     numbers = value if isinstance(value, list) else []
     if len(numbers) < 2 or not all(_is_number(number) for number in numbers[:2]):
-        raise InvalidValue(f"{where}: must be x, y and z in metres, found {clip_text(repr(value))}")
+        raise InvalidValue(f"{where}: must be x, y and z in metres, found {value_text(value)}")
     return float(numbers[0]), float(numbers[1])
 
 

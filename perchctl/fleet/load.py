@@ -6,11 +6,12 @@ connected or opened.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 
 from perchctl.camera import parse_source
 from perchctl.corridor import Point
@@ -21,7 +22,7 @@ from perchctl.fleet.fleet import MOST_VEHICLES, Fleet, FleetVehicle, Frame
 from perchctl.fleet.radio import choose_dongles
 from perchctl.link import check_uri, is_own_uri
 from perchctl.places import data_file, file_names
-from perchctl.plain_yaml import clip_text
+from perchctl.plain_yaml import clip_text, value_text
 from perchctl.profile import (
     Profile,
     Section,
@@ -39,8 +40,8 @@ FARTHEST_M = 50.0
 """Largest distance of a home or target from the room's origin, m. A number beyond this limit is
 probably in millimetres."""
 _Length = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
-_ORDER = r"^(one-at-a-time|together|[1-9][0-9]? at a time)$"
-_NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$"
+_ORDER = r"one-at-a-time|together|[1-9][0-9]? at a time"
+_NAME = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}"
 _PROFILE_KEYS = tuple(name for name in Profile.model_fields if name not in ("name", "description"))
 _SECTIONS = tuple(name for name in _PROFILE_KEYS if name != "date")
 _ALSO_TEXT = ("target", "positioning")
@@ -58,18 +59,29 @@ class _Common(Section):
 
 
 class _Vehicle(_Common):
-    name: str = key(..., "name of the vehicle", pattern=_NAME_PATTERN)
+    name: str = key(..., "name of the vehicle")
     home_m: tuple[_Length, _Length] = key(..., "position before take-off: x, y")
     target_m: tuple[_Length, _Length] | None = key(None, "position of the vehicle's target: x, y")
     body: str | None = key(
         None, "name of the vehicle's rigid body in the motion-capture system", min_length=1
     )
 
+    @field_validator("name", mode="before")
+    @classmethod
+    def _fit_for_a_file(cls, name: Any) -> Any:
+        if isinstance(name, str) and re.fullmatch(_NAME, name):
+            return name
+        quotes = "" if isinstance(name, str) else "; put a number in quotes"
+        raise ValueError(
+            f"found {value_text(name)}; allowed are at most 32 letters, digits, -, _ and ., of "
+            f"which the first is a letter or digit{quotes}"
+        )
+
 
 class _File(Section):
     name: str | None = key(None, "name of the fleet")
     defaults: dict[str, Any] = Field(default_factory=dict)
-    order: str = key("one-at-a-time", "how many vehicles fly at a time", pattern=_ORDER)
+    order: str = key("one-at-a-time", "how many vehicles fly at a time")
     on_failure: Literal["continue", "land-all"] = key(
         "continue", "what the other vehicles do if one fails"
     )
@@ -78,8 +90,20 @@ class _File(Section):
         None, "minimum distance between two corridors in use at the same time", ge=0.2, le=10
     )
     vehicles: list[dict[str, Any]] = key(
-        ..., "the vehicles", min_length=1, max_length=MOST_VEHICLES
+        ..., "the vehicles, each with a name and home_m", min_length=1, max_length=MOST_VEHICLES
     )
+
+    @field_validator("order", mode="before")
+    @classmethod
+    def _number_or_word(cls, order: Any) -> Any:
+        is_number = isinstance(order, int) and not isinstance(order, bool)
+        text = f"{order} at a time" if is_number else order
+        if isinstance(text, str) and re.fullmatch(_ORDER, text):
+            return text
+        raise ValueError(
+            f"found {value_text(order)}; allowed are one-at-a-time, together, or a number from 1 "
+            f"to 99, as in 2 at a time"
+        )
 
 
 def find_fleet(name: str) -> Path:
@@ -91,9 +115,8 @@ def find_fleet(name: str) -> Path:
     found = data_file("fleets", name) if "/" not in name else None
     if found is None:
         what = "is a folder" if path.is_dir() else "does not exist"
-        raise NotFound(
-            f"fleet file {name} {what}; give a path, or one of {', '.join(file_names('fleets'))}"
-        )
+        names = ", ".join(f"'{each}'" for each in file_names("fleets"))
+        raise NotFound(f"fleet file {name} {what}; give a path, or one of these names: {names}")
     return found
 
 
@@ -137,7 +160,7 @@ def _vehicle(
     path: Path, number: int, entry: dict[str, Any], common: _Common, shared: dict[str, Any]
 ) -> FleetVehicle:
     name = entry.get("name")
-    where = f"{path}: vehicle {clip_text(str(name)) if name is not None else number}"
+    where = f"{path}: vehicle {clip_text(name) if isinstance(name, str) and name else number}"
     own_values, sections = _split(where, _Vehicle, entry)
     own: _Vehicle = _validated(where, _Vehicle, own_values)
     layers = [*_layers(path, where, common, shared), *_layers(path, where, own, sections)]
@@ -310,7 +333,7 @@ def _split(
         is_text = name in _ALSO_TEXT and isinstance(value, str)
         if name in _SECTIONS and not is_text and not isinstance(value, dict):
             raise InvalidValue(
-                f"{where}: {name}: must have keys and values, found {clip_text(repr(value))}; "
+                f"{where}: {name}: must have keys and values, found {value_text(value)}; "
                 f"add some, or remove the section"
             )
     return own, sections
@@ -321,20 +344,9 @@ def _validated(where: object, model: type[Section], values: dict[str, Any]) -> A
         return model.model_validate(values)
     except ValidationError as error:
         key, reason = key_and_reason(error, model)
-        raise InvalidValue(f"{where}: {key or 'fleet'}: {_in_words(key, reason)}") from None
-
-
-def _in_words(key: str, reason: str) -> str:
-    """Return the reason for an error, with the allowed values in words instead of pydantic's
-    regular expression."""
-    found = reason.rpartition(", found ")[2]
-    if reason.startswith("string should match") and key == "order":
-        return f"found {found}; allowed are one-at-a-time, together, or a number as in 2 at a time"
-    if reason.startswith("string should match"):
-        return f"found {found}; allowed are at most 32 letters, digits, -, _ and ."
-    if reason.startswith("field required"):
-        return f"is missing; {_NEEDED.get(key, 'add it')}"
-    return reason
+        if reason == "is missing; add it":
+            reason = f"is missing; {_NEEDED.get(key, 'add it')}"
+        raise InvalidValue(f"{where}: {key or 'fleet'}: {reason}") from None
 
 
 _NEEDED = {

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from perchctl.errors import InvalidValue, NotFound, ProfileNote, distinct_texts, require_type
 from perchctl.files import file_kind, kind_note
 from perchctl.places import data_file, data_folder, file_names
-from perchctl.plain_yaml import parse_yaml
+from perchctl.plain_yaml import parse_yaml, value_text
 from perchctl.profile.base import split_constant_keys
 from perchctl.profile.schema import Profile, key_and_reason
 from perchctl.profile.vision import MergeConfig, WeightsConfig
@@ -305,7 +305,7 @@ def _values_of(text: str, path: Path, expected: str = "a profile") -> dict[str, 
     if values is None:
         return {}
     if not isinstance(values, dict):
-        raise InvalidValue(f"{path}: must have keys and values, found {type(values).__name__}")
+        raise InvalidValue(f"{path}: must have keys and values, found {value_text(values)}")
     return values
 
 
@@ -320,5 +320,12 @@ def _merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 
 def _one_sentence(path: Path, error: ValidationError) -> str:
     key, text = key_and_reason(error)
-    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    others = len({_key_of(each["loc"]) for each in error.errors(include_url=False)}) - 1
+    more = f" (and {others} more error{'s' if others > 1 else ''})" if others else ""
     return f"{path}: {key or 'profile'}: {text}{more}"
+
+
+def _key_of(loc: tuple[int | str, ...]) -> tuple[int | str, ...]:
+    """Return the place of the key with an error. The last part of `loc` may be the number of an
+    item in the key's list, or the name of a type that the key allows."""
+    return loc[:-1] if loc and (isinstance(loc[-1], int) or loc[-1] in ("int", "float")) else loc

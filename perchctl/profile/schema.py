@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import datetime
 import difflib
-from collections.abc import Collection, Mapping
-from typing import Any, Literal, get_args
+from collections.abc import Collection, Mapping, Sequence
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic.fields import FieldInfo
 
 from perchctl.errors import InvalidValue, require_type
-from perchctl.plain_yaml import clip_text
+from perchctl.plain_yaml import clip_text, value_text
 from perchctl.profile.base import Section, key, split_constant_keys
 from perchctl.profile.limits import IMPOSSIBLE
 from perchctl.profile.mission import PlannerConfig, SafetyConfig
@@ -174,32 +176,96 @@ class Profile(Section):
 
 
 _MOST_OF_A_FAULT = 1000
-_BOUNDS = ("less_than_equal", "greater_than_equal")
+_LIMITS = {
+    "greater_than": ("gt", "above"),
+    "greater_than_equal": ("ge", "at least"),
+    "less_than": ("lt", "below"),
+    "less_than_equal": ("le", "at most"),
+}
+_KINDS = {
+    "string": "text",
+    "float": "a number",
+    "int": "a whole number",
+    "bool": "true or false",
+    "date": "a date, as in 2026-01-31",
+    "finite": "a finite number",
+}
+"""Words for the value that a key takes, by the first word of pydantic's type of error."""
 
 
 def key_and_reason(error: ValidationError, model: Any = Profile) -> tuple[str, str]:
-    """Return the key of the first error (empty if it concerns several keys) and the reason.
-    `model`: the model that was validated."""
+    """Return the key of the first error (empty if it concerns several keys), and the reason in
+    plain words: what was found, and what is allowed. All messages about values in YAML files are
+    made here. `model`: the model that was validated."""
     first = error.errors(include_url=False)[0]
-    key = clip_text(".".join(str(part) for part in first["loc"]))
-    if first["type"] == "extra_forbidden":
-        above = first["loc"][:-1]
-        keys = _keys_at(model, above)
-        if model is Profile and not above:
+    loc, kind, context = first["loc"], first["type"], first.get("ctx", {})
+    found = f"found {value_text(first['input'])}"
+    key = clip_text(".".join(str(part) for part in loc))
+    above = clip_text(".".join(str(part) for part in loc[:-1]))
+    in_list = bool(loc) and isinstance(loc[-1], int)
+    if kind == "extra_forbidden":
+        keys = _keys_at(model, loc[:-1])
+        if model is Profile and not loc[:-1]:
             keys = ["extends", *keys]
-        text = f"this key is unknown; {nearest_names(str(first['loc'][-1]), keys)}"
-    elif first["type"] == "value_error":
-        text = clip_text(str(first["ctx"]["error"]), _MOST_OF_A_FAULT)
-    elif first["type"] == "model_type":
-        found = clip_text(repr(first["input"]))
-        text = f"must have keys and values, found {found}; add some, or remove it"
-    else:
-        found = clip_text(repr(first["input"]))
-        text = f"{first['msg'][:1].lower()}{first['msg'][1:]}, found {found}"
-        names = [part for part in first["loc"] if isinstance(part, str)]
-        if names and names[-1].endswith("_m") and first["type"] in _BOUNDS:
-            text += " (the unit is metres, not millimetres or centimetres)"
-    return key, text
+        return key, f"this key is unknown; {nearest_names(str(loc[-1]), keys)}"
+    if kind == "value_error":
+        return key, clip_text(str(context["error"]), _MOST_OF_A_FAULT)
+    if kind == "missing" and in_list:
+        return above, f"{_list_text(model, loc[:-1])}, {found}"
+    if kind == "missing":
+        return key, "is missing; add it"
+    if kind in ("model_type", "dict_type"):
+        key = f"{above}, number {int(loc[-1]) + 1}" if in_list else key
+        return key, f"must have keys and values, {found}; add some, or remove it"
+    if kind in ("tuple_type", "list_type"):
+        return key, f"{_list_text(model, loc)}, {found}"
+    if kind == "too_short":
+        return key, f"must have at least {_count(context['min_length'], 'entry')}, {found}"
+    if kind == "too_long" and context["field_type"] == "Tuple":
+        return key, f"{_list_text(model, loc)}, {found}"
+    if kind == "too_long":
+        most = _count(context["max_length"], "entry")
+        return key, f"must have at most {most}, found {len(first['input'])}"
+    if kind == "literal_error":
+        return key, f"must be {context['expected'].replace(chr(39), '')}, {found}"
+    if kind in _LIMITS:
+        limit, words = _LIMITS[kind]
+        names = [part for part in loc if isinstance(part, str)]
+        is_length = bool(names) and names[-1].endswith("_m") and kind.endswith("_equal")
+        unit = " (the unit is metres, not millimetres or centimetres)" if is_length else ""
+        return key, f"must be {words} {context[limit]:g}, {found}{unit}"
+    if kind == "string_pattern_mismatch":
+        return key, f"{found}; allowed here: {_description(model, loc)}"
+    if kind == "string_too_short":
+        return key, "must not be empty"
+    # In a union such as `int | float`, the last part of `loc` is the name of one of its types.
+    if len(loc) > 1 and loc[-1] in ("int", "float"):
+        key, kind = above, "float_type"
+    words = _KINDS.get(kind.partition("_")[0], "another value")
+    is_unquoted = words == "text" and isinstance(first["input"], int | float)
+    return key, f"must be {words}, {found}{': put it in quotes' if is_unquoted else ''}"
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what if number == 1 else what[:-1] + 'ies'}"
+
+
+def _list_text(model: Any, loc: tuple[int | str, ...]) -> str:
+    """Say what the list at `loc` must contain."""
+    names = [part for part in loc if isinstance(part, str)]
+    kind = _field_at(model, names).annotation
+    for _ in range(len(loc) - len(names)):
+        kind = get_args(_present(kind))[0]
+    kinds = get_args(_present(kind))
+    meaning = _description(model, loc)
+    if get_origin(_present(kind)) is not tuple or ... in kinds:
+        return f"must be a list ({meaning})"
+    return f"must be {len(kinds)} numbers in brackets ({meaning})"
+
+
+def _description(model: Any, loc: tuple[int | str, ...]) -> str:
+    names = [part for part in loc if isinstance(part, str)]
+    return (_field_at(model, names).description or "see docs/profiles.md").replace("`", "")
 
 
 def nearest_names(name: str, allowed: Collection[str]) -> str:
@@ -209,9 +275,23 @@ def nearest_names(name: str, allowed: Collection[str]) -> str:
     return f"{f'did you mean {close[0]}? ' if close else ''}allowed here are {', '.join(allowed)}"
 
 
+def _field_at(model: Any, names: Sequence[str]) -> FieldInfo:
+    *above, last = names
+    for name in above:
+        model = _present(model.model_fields[name].annotation)
+    field: FieldInfo = model.model_fields[last]
+    return field
+
+
+def _present(kind: Any) -> Any:
+    """Return the type of a value that is present: a value that may be missing has a union with
+    None. Constraints are left out."""
+    if get_origin(kind) in (Union, UnionType):
+        kind = next(each for each in get_args(kind) if each is not type(None))
+    return get_args(kind)[0] if get_origin(kind) is Annotated else kind
+
+
 def _keys_at(model: Any, loc: tuple[int | str, ...]) -> list[str]:
     for part in loc:
-        kind = model.model_fields[part].annotation
-        # A section that may be missing is a union with None.
-        model = next((each for each in get_args(kind) if each is not type(None)), kind)
+        model = _present(model.model_fields[part].annotation)
     return list(model.model_fields)

@@ -14,6 +14,7 @@ from pydantic import Field, field_validator, model_validator
 
 from perchctl.extensions import PATTERN
 from perchctl.geometry import Array, make_T, rotation_from_rpy
+from perchctl.plain_yaml import value_text
 from perchctl.profile.base import BodyVector3, Section, Vector3, key
 
 # --- ArUco dictionaries by name, and the number of their ids ---
@@ -153,8 +154,8 @@ class CameraConfig(Section):
         if latency_s == "measured" or (number and 0.0 <= latency_s <= MOST_CAMERA_LATENCY_S):
             return latency_s
         raise ValueError(
-            f"found {latency_s!r}; allowed are 0 to {MOST_CAMERA_LATENCY_S:g} (seconds), or "
-            "the word measured, to have each flight measure the latency"
+            f"found {value_text(latency_s)}; allowed are 0 to {MOST_CAMERA_LATENCY_S:g} (seconds), "
+            "or the word measured, to have each flight measure the latency"
         )
 
     @property

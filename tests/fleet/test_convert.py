@@ -118,8 +118,17 @@ def test_what_is_missing_is_refused_until_it_is_there(tmp_path: Path, text: str)
     [
         ("extends: sim\n", "has neither robots, like Crazyswarm2's crazyflies.yaml, nor a list"),
         ("robots: {a: {enabled: false}}\n", "no vehicle in this file is switched on"),
-        ("robots: {a: {enabled: true}}\n", "robots.a: has no uri"),
-        ("robots: {a: 3}\n", "robots.a: must contain keys and values, found int"),
+        (
+            "robots: {a: {enabled: true}}\n",
+            "robots.a: uri: is missing; add the vehicle's URI, as in radio",
+        ),
+        ("robots: {a: 3}\n", "robots.a: must have keys and values, found 3"),
+        (
+            "robots: {a: {enabled: true, uri: 5}}\n",
+            "robots.a: uri: must be text, as in radio://0/80/2M/E7E7E7E7E7, found 5",
+        ),
+        ("units: [{name: a, uri: 'usb://0'}, {name: b}]\n", "units, number 2 (b): uri: is missing"),
+        ("units: [{}]\n", "units, number 1: uri: is missing"),
         (
             "robots: {a: {enabled: true, uri: 'usb://0', initial_position: [1, x]}}\n",
             "robots.a.initial_position: must be x, y and z in metres, found [1, 'x']",
@@ -130,7 +139,18 @@ def test_what_is_missing_is_refused_until_it_is_there(tmp_path: Path, text: str)
         ),
         ("units: [{uri: 'usb://0', name: a}, {uri: 'usb://1', name: A}]\n", "two vehicles would"),
     ],
-    ids=["profile", "off", "no-uri", "no-keys", "place", "no-float", "twice"],
+    ids=[
+        "profile",
+        "off",
+        "no-uri",
+        "no-keys",
+        "bad-uri",
+        "unit",
+        "no-name",
+        "place",
+        "no-float",
+        "twice",
+    ],
 )
 def test_what_is_no_such_list_is_one_sentence(tmp_path: Path, text: str, sentence: str) -> None:
     assert refusal(tmp_path, text).startswith(sentence)

@@ -101,7 +101,7 @@ def test_by_the_target_alone_no_point_is_approached(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("order", "most"), [("one-at-a-time", 1), ("together", 2), ("7 at a time", 7)]
+    ("order", "most"), [("one-at-a-time", 1), ("together", 2), ("7 at a time", 7), ("3", 3)]
 )
 def test_order_says_how_many_fly_at_a_time(tmp_path: Path, order: str, most: int) -> None:
     assert load(tmp_path, two(top=f"order: {order}")).most_at_once == most
@@ -149,7 +149,38 @@ BAD_URI = "'radio://0/80/3M/E7' is not the URI of a vehicle; examples: sim://"
 REFUSED = [
     (two(top="odrer: together"), "odrer: this key is unknown; did you mean order?"),
     (two(top="order: two"), "order: found 'two'; allowed are one-at-a-time, together, or"),
-    (two(top="separation_m: 0.1"), "separation_m: input should be greater than or equal to 0.2"),
+    (
+        two(top="order: 0"),
+        "order: found 0; allowed are one-at-a-time, together, or a number from 1",
+    ),
+    (two(top="order:"), "order: found nothing; allowed are one-at-a-time, together, or a number"),
+    (two(top="assign: yes"), "assign: must be fixed or nearest, found true"),
+    (two(top="on_failure:"), "on_failure: must be continue or land-all, found nothing"),
+    ("vehicles: []", "vehicles: must have at least 1 entry, found []"),
+    ("vehicles: [a]", "vehicles, number 1: must have keys and values, found 'a'; add some, or"),
+    (
+        "vehicles: 3",
+        "vehicles: must be a list (the vehicles, each with a name and home_m), found 3",
+    ),
+    (
+        f"vehicles: [{', '.join(['{name: a, home_m: [0, 0]}'] * 33)}]",
+        "vehicles: must have at most 32 entries, found 33",
+    ),
+    (two().replace("name: north", "name: ''"), "vehicle 1: name: found ''; allowed are at most 32"),
+    (two().replace("name: north", "name: 5"), "vehicle 1: name: found 5; allowed are at most 32"),
+    (two(first=", heading_deg: up"), "vehicle north: heading_deg: must be a number, found 'up'"),
+    (
+        two().replace("[3, 0]", "[3, 0, 0]"),
+        "vehicle east: home_m: must be 2 numbers in brackets (position before take-off: x, y), "
+        "found [3, 0, 0]",
+    ),
+    (
+        two().replace("[3, 0]", "3 0"),
+        "vehicle east: home_m: must be 2 numbers in brackets (position before take-off: x, y), "
+        "found '3 0'",
+    ),
+    ("- a list", "must have keys and values, found ['a list']"),
+    (two(top="separation_m: 0.1"), "separation_m: must be at least 0.2, found 0.1"),
     (two(first=", hme_m: [0, 0]"), "vehicle north: hme_m: this key is unknown; did you mean home"),
     (two(first=", safety: {fence_m: 1}"), "vehicle north: safety.fence_m: this key is unknown"),
     (two(defaults=", home_m: [0, 0]"), "defaults: home_m: this key is unknown"),
@@ -189,7 +220,10 @@ REFUSED = [
         two(", frame: home", defaults=", positioning: mocap"),
         "vehicle north: frame: is home, but with positioning by motion capture at vicon its",
     ),
-    (two().replace("[3, 0]", "[3000, 0]"), "vehicle east: home_m.0: input should be less than"),
+    (
+        two().replace("[3, 0]", "[3000, 0]"),
+        "vehicle east: home_m.0: must be at most 50, found 3000 (the unit is metres",
+    ),
     ("extends: sim\n", "has no vehicles, so it is not a fleet file: list them under vehicles"),
     (two(first=", name: west"), "line 4: key name appears twice, first on line 4: keep only one"),
 ]
@@ -219,5 +253,7 @@ def test_a_section_may_be_text_and_the_date_is_no_section(tmp_path: Path) -> Non
 
 
 def test_a_fleet_that_is_missing_names_the_choices() -> None:
-    with pytest.raises(NotFound, match=r"fleet file none.yaml does not exist; .* one of four"):
+    with pytest.raises(
+        NotFound, match=r"fleet file none.yaml does not exist; .* one of these names: 'four'$"
+    ):
         load_fleet("none.yaml")

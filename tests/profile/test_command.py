@@ -194,14 +194,14 @@ def test_a_password_is_in_the_source_alone(tmp_path: Path) -> None:
 
 WRONG: dict[str, tuple[str, str]] = {
     "link.uri": ("bogus", "radio://0/80/2M"),
-    "positioning.by": ("flow", "'deck', 'mocap' or 'target'"),
+    "positioning.by": ("flow", "must be deck, mocap or target, found 'flow'"),
     "camera.source": ("webcam:0", "camera:N"),
     "camera.calibration": ("none.yaml", "give a path"),
     "camera.latency_s": ("80", "allowed are 0 to 1"),
     "front": ("up", "top, right, bottom, left"),
     "left": ("bottom", "right, left"),
     "camera.mount.position_m": ("[30, 0, 10]", "millimetres"),
-    "vehicle.gear_body_m": ("0.4", "tuple"),
+    "vehicle.gear_body_m": ("0.4", "must be 3 numbers in brackets"),
     "target.large.side_m": ("15 cm", "number"),
     "target.small.side_m": ("0.08", "less than half"),
     "ceiling": ("0.2", "1 to 10 m"),
