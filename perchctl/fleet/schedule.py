@@ -14,19 +14,22 @@ is an obstacle for the others:
     i hangs in j's corridor  ->  j flies before i
 
 An order that satisfies all of these constraints is found by topological sorting. If there is no
-such order, the error names two vehicles.
+such order, the error names the vehicles whose constraints form a circle, and the remedies with
+which a plan would succeed.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from graphlib import CycleError, TopologicalSorter
 
 from perchctl.corridor import Corridor
 from perchctl.errors import InvalidValue
+from perchctl.fleet.assignment import assign_nearest
 from perchctl.fleet.fleet import Fleet, FleetVehicle
 from perchctl.profile import CorridorConfig, Profile
 
@@ -65,6 +68,9 @@ OBSTACLE_M = 0.24
 """Minimum distance between a vehicle that is waiting or hanging and a corridor that is being flown,
 m: twice the radius of 0.12 m that Crazyswarm assumes for a vehicle. Smaller: propellers may touch.
 Larger: fewer targets fit."""
+FAR_M = 10.0
+"""Distance from home to target above which a wrong number in the fleet file is a more likely reason
+than a fence that is too small, m. Larger: more errors are answered with a larger fence."""
 
 
 # --- Corridors ---
@@ -175,21 +181,21 @@ def make_schedule(fleet: Fleet) -> Schedule:
     """Decide who flies with whom, and in which order: as many at a time as `fleet.order` allows, in
     the order of the file unless a vehicle is in the way of another.
 
-    Raises InvalidValue, naming two vehicles and the distance, if no order exists, or if a target
-    cannot be reached.
+    Raises InvalidValue, naming the vehicles, the distances and what to do, if no order exists, or
+    if a target cannot be reached.
     """
-    vehicles = fleet.vehicles
-    corridors = {vehicle.name: vehicle_corridor(vehicle) for vehicle in vehicles}
-    for vehicle in vehicles:
-        _check_fence(vehicle)
-    for pair in itertools.combinations(vehicles, 2):
-        _check_targets(*pair)
+    corridors = _corridors(fleet)
+    for problem_text in _problems(fleet, corridors):
+        raise InvalidValue(problem_text())
     separation_m = SEPARATION_M if fleet.separation_m is None else fleet.separation_m
     conflicts = find_conflicts(corridors, separation_m)
     precedences = find_precedences(corridors)
-    _refuse_circles(precedences, corridors)
     groups = _groups(list(corridors), fleet.most_at_once, conflicts, precedences)
     return Schedule(groups=groups, conflicts=conflicts, precedences=precedences)
+
+
+def _corridors(fleet: Fleet) -> dict[str, Corridor]:
+    return {vehicle.name: vehicle_corridor(vehicle) for vehicle in fleet.vehicles}
 
 
 def find_conflicts(
@@ -227,6 +233,8 @@ def find_precedences(corridors: dict[str, Corridor]) -> tuple[Precedence, ...]:
 
 
 def _apart(gap_m: float) -> str:
+    if abs(gap_m) < 0.005:
+        return "touch"
     return f"overlap by {-gap_m:.2f} m" if gap_m < 0.0 else f"are {gap_m:.2f} m apart"
 
 
@@ -235,8 +243,10 @@ def _from(gap_m: float, other: str) -> str:
 
 
 def gap_text(gap_m: float) -> str:
-    """Return text such as "0.10 m from" or "0.10 m inside" for a position whose distance from a
-    corridor's edge is `gap_m` (negative inside)."""
+    """Return text such as "0.10 m from", "0.10 m inside" or "at the edge of" for a position whose
+    distance from a corridor's edge is `gap_m` (negative inside)."""
+    if abs(gap_m) < 0.005:
+        return "at the edge of"
     return f"{-gap_m:.2f} m inside" if gap_m < 0.0 else f"{gap_m:.2f} m from"
 
 
@@ -266,70 +276,128 @@ def _groups(
 # --- Refusals ---
 
 
-def _refuse_circles(precedences: Sequence[Precedence], corridors: dict[str, Corridor]) -> None:
-    """Raise InvalidValue if no order satisfies all precedences. If there are several cycles of
-    precedences, report one with only two vehicles if possible."""
+def _problems(fleet: Fleet, corridors: dict[str, Corridor]) -> Iterator[Callable[[], str]]:
+    """Yield a function for each reason why the fleet cannot be flown, which returns the reason and
+    what to do in one sentence. Finding out what to do may require further plans."""
+    for vehicle in fleet.vehicles:
+        away_m = math.dist(vehicle.home_m, vehicle.target_m)
+        if away_m + WANDER_M > vehicle.profile.safety.fence_radius_m:
+            yield partial(_beyond_fence, vehicle, away_m, fleet)
+    for first, second in itertools.combinations(fleet.vehicles, 2):
+        apart_m = math.dist(first.target_m, second.target_m)
+        within_m = max(v.profile.target.expected_within_m for v in (first, second))
+        if have_common_marker(first, second) and apart_m <= within_m:
+            yield partial(_like_targets, first, second, apart_m, within_m)
+    if circle := _find_circle(find_precedences(corridors), list(corridors)):
+        yield partial(_without_order, circle, fleet, corridors)
+
+
+def _can_be_flown(fleet: Fleet) -> bool:
+    return not any(_problems(fleet, _corridors(fleet)))
+
+
+def _find_circle(precedences: Sequence[Precedence], names: Sequence[str]) -> list[Precedence]:
+    """Return precedences that no order satisfies, each beginning with the vehicle at which the one
+    before it ends; empty if there is an order. Two vehicles are preferred to longer circles."""
     by_pair: dict[tuple[str, str], Precedence] = {}
     for each in precedences:
         by_pair.setdefault((each.first, each.then), each)
-    for first, second in itertools.combinations(corridors, 2):
-        there, back = by_pair.get((first, second)), by_pair.get((second, first))
-        if there is not None and back is not None:
-            raise InvalidValue(
-                f"there is no order in which {first} and {second} can fly: {there.why}, and "
-                f"{back.why}; {_advice(first, second, corridors)}"
-            )
+    for first, second in itertools.combinations(names, 2):
+        if (first, second) in by_pair and (second, first) in by_pair:
+            return [by_pair[first, second], by_pair[second, first]]
     sorter: TopologicalSorter[str] = TopologicalSorter()
     for first, then in by_pair:
         sorter.add(then, first)
     try:
         sorter.prepare()
     except CycleError as error:
-        circle = error.args[1]  # each vehicle must fly before the next one
-        each = by_pair[circle[0], circle[1]]
-        raise InvalidValue(
-            f"there is no order in which {each.first} and {each.then} can fly, because the order "
-            f"{' before '.join(circle)} would be needed: {each.why}; "
-            f"{_advice(each.first, each.then, corridors)}"
-        ) from None
+        return [by_pair[pair] for pair in itertools.pairwise(error.args[1])]
+    return []
 
 
-def _advice(first: str, then: str, corridors: dict[str, Corridor]) -> str:
-    radius_m = max(corridors[first].radius_m, corridors[then].radius_m)
-    least_m = WANDER_M + ROOM_ERROR_M
-    more = (
-        f", or use a motion-capture system or Lighthouse (frame: room), with which a corridor "
-        f"radius of {least_m:.2f} m is enough instead of {radius_m:.2f} m"
-    )
+def _without_order(
+    circle: Sequence[Precedence], fleet: Fleet, corridors: dict[str, Corridor]
+) -> str:
+    if len(circle) == 2:
+        whys = [each.why for each in circle]
+    else:
+        whys = [f"{p.first} must fly before {p.then} because {p.why}" for p in circle]
+    names = sorted((each.first for each in circle), key=list(corridors).index)
+    remedies = ["move a home or target farther away", *_remedies(circle, fleet, corridors)]
     return (
-        f"a waiting or hanging vehicle must be at least {OBSTACLE_M:g} m away from "
-        f"another vehicle's corridor: move a home or target farther "
-        f"away{more if radius_m > least_m else ''}"
+        f"there is no order in which {_and(names)} can fly: {_and(whys)}; a waiting or hanging "
+        f"vehicle must be at least {OBSTACLE_M:g} m away from another vehicle's corridor: "
+        f"{', or '.join(remedies)}"
     )
 
 
-def _check_fence(vehicle: FleetVehicle) -> None:
-    away_m = math.dist(vehicle.home_m, vehicle.target_m)
-    fence_m = vehicle.profile.safety.fence_radius_m
-    if away_m + WANDER_M > fence_m:
-        raise InvalidValue(
-            f"the target of {vehicle.name} is {away_m:.2f} m from its home, and a "
-            f"draught can carry the vehicle {WANDER_M:g} m farther, but safety.fence_radius_m is "
-            f"{fence_m:g} m: move its home nearer to the target, or set a larger fence"
+def _and(parts: Sequence[str]) -> str:
+    *others, last = parts
+    comma = "," if " " in last else ""
+    return f"{', '.join(others)}{comma} and {last}"
+
+
+def _remedies(
+    circle: Sequence[Precedence], fleet: Fleet, corridors: dict[str, Corridor]
+) -> list[str]:
+    """Return changes with which the whole fleet can be flown, found by planning it with each."""
+    nearest = assign_nearest(fleet)
+    by_nearest = "set assign: nearest if the targets are interchangeable"
+    radius_m = max(corridors[each.first].radius_m for each in circle)
+    by_room = (
+        f"use a motion-capture system or Lighthouse (frame: room), with which a corridor radius of "
+        f"{WANDER_M + ROOM_ERROR_M:.2f} m is enough instead of {radius_m:.2f} m"
+    )
+    single = [(nearest, by_nearest), (_in_room_axes(fleet), by_room)]
+    found = [words for changed, words in single if _can_be_flown(changed)]
+    if not found and _can_be_flown(_in_room_axes(nearest)):
+        found = [f"{by_nearest}, and {by_room}"]
+    return found
+
+
+def _in_room_axes(fleet: Fleet) -> Fleet:
+    """Return the fleet as it would be with motion capture."""
+    vehicles = []
+    for vehicle in fleet.vehicles:
+        positioning = vehicle.profile.positioning.model_copy(update={"by": "mocap"})
+        profile = vehicle.profile.model_copy(update={"positioning": positioning})
+        vehicles.append(replace(vehicle, frame="room", profile=profile))
+    return replace(fleet, vehicles=tuple(vehicles))
+
+
+def _beyond_fence(vehicle: FleetVehicle, away_m: float, fleet: Fleet) -> str:
+    others = [each for each in fleet.vehicles if each.name != vehicle.name]
+    near_m, near = min(
+        ((math.dist(vehicle.home_m, each.target_m), each.name) for each in others),
+        default=(math.inf, ""),
+    )
+    advice = []
+    if near_m < away_m:
+        advice.append(
+            f"if the targets are swapped (the target of {near} is only {near_m:.2f} m from this "
+            f"home), correct target_m"
         )
+        if _can_be_flown(assign_nearest(fleet)):
+            advice.append("if they are interchangeable, set assign: nearest")
+    if away_m > FAR_M:
+        advice.append("check home_m and target_m")
+    else:
+        advice.append("move its home nearer to the target, or set a larger fence")
+    return (
+        f"the target of {vehicle.name} is {away_m:.2f} m from its home, and a draught can carry "
+        f"the vehicle {WANDER_M:g} m farther, but safety.fence_radius_m is "
+        f"{vehicle.profile.safety.fence_radius_m:g} m: {'; '.join(advice)}"
+    )
 
 
-def _check_targets(first: FleetVehicle, second: FleetVehicle) -> None:
-    """Raise InvalidValue if a vehicle could confuse two targets."""
-    apart_m = math.dist(first.target_m, second.target_m)
-    for one, other in ((first, second), (second, first)):
-        within_m = one.profile.target.expected_within_m
-        if have_common_marker(one, other) and apart_m <= within_m:
-            raise InvalidValue(
-                f"the targets of {one.name} and {other.name} have a marker id in common and are "
-                f"{apart_m:.2f} m apart, within target.expected_within_m ({within_m:g} m): print "
-                f"targets with different ids, or hang them farther apart"
-            )
+def _like_targets(
+    first: FleetVehicle, second: FleetVehicle, apart_m: float, within_m: float
+) -> str:
+    return (
+        f"the targets of {first.name} and {second.name} have a marker id in common and are "
+        f"{apart_m:.2f} m apart, within target.expected_within_m ({within_m:g} m): print targets "
+        f"with different ids, or hang them farther apart"
+    )
 
 
 def have_common_marker(one: FleetVehicle, other: FleetVehicle) -> bool:

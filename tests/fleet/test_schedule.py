@@ -196,8 +196,77 @@ def test_a_circle_of_three_is_refused() -> None:
     ways: list[tuple[Point, Point]] = [((0, 0), (2, 0)), ((2, 0), (2, 2)), ((2, 2), (0, 0.4))]
     sentence = refusal(fleet(ways, order="together"))
     assert re.match(
-        r"there is no order in which v\d and v\d can fly, because the order v\d before ", sentence
+        r"there is no order in which v0, v1 and v2 can fly: v\d must fly before v\d because v\d "
+        r"(waits|hangs) .*, v\d must fly before v\d because .*, and v\d must fly before v\d be",
+        sentence,
     )
+
+
+def deck(ways: list[tuple[Point, Point]]) -> Fleet:
+    """A fleet of vehicles with Flow decks."""
+    planned = fleet(ways, "deck", order="together")
+    return replace(planned, vehicles=tuple(replace(v, frame="home") for v in planned.vehicles))
+
+
+NEAREST = "or set assign: nearest if the targets are interchangeable"
+ROOM = "or use a motion-capture system or Lighthouse (frame: room)"
+BOTH = "and use a motion-capture system or Lighthouse (frame: room)"
+REMEDIES: dict[str, tuple[list[tuple[Point, Point]], list[str]]] = {
+    "swapped": ([((0, 0), (1, 0)), ((1, 0), (0, 0))], [NEAREST]),
+    "swapped, close": ([((0, 0), (0.7, 0)), ((0.7, 0), (0, 0))], [NEAREST, BOTH]),
+    "close": ([((0, 0), (0.1, 0)), ((0.8, 0), (0.9, 0))], [ROOM]),
+    "in line": ([((0, 0), (2, 0)), ((0.5, 0), (1, 0)), ((1.5, 0), (1.5, 0))], []),
+}
+
+
+@pytest.mark.parametrize(("ways", "remedies"), REMEDIES.values(), ids=REMEDIES)
+def test_a_remedy_is_named_only_if_the_whole_plan_passes_with_it(
+    ways: list[tuple[Point, Point]], remedies: list[str]
+) -> None:
+    sentence = refusal(deck(ways))
+    assert "move a home or target farther away" in sentence
+    for words in (NEAREST, ROOM, BOTH):
+        assert (words in sentence) is (words in remedies), sentence
+
+
+@given(st.lists(st.tuples(POINT, POINT), min_size=2, max_size=3))
+def test_what_a_refusal_advises_can_be_flown(ways: list[tuple[Point, Point]]) -> None:
+    planned = deck(ways)
+    try:
+        make_schedule(planned)
+    except InvalidValue as error:
+        if NEAREST in str(error) and BOTH not in str(error):
+            make_schedule(assign_nearest(planned))
+        if ROOM in str(error):
+            make_schedule(fleet(ways))
+        if BOTH in str(error):
+            make_schedule(assign_nearest(fleet(ways)))
+
+
+def test_a_place_on_the_edge_is_not_0_m_away() -> None:
+    schedule = make_schedule(fleet([((0, 0), (1, 0)), ((1.35, 0), (3, 0))]))
+    whys = [each.why for each in schedule.precedences]
+    assert "v1 waits on the floor at the edge of the corridor of v0" in whys
+    schedule = make_schedule(fleet([((0, 0), (0, 1)), ((0.7, 0), (0.7, 1))], order="together"))
+    assert [c.why for c in schedule.conflicts] == ["their corridors touch"]
+
+
+def test_swapped_targets_beyond_the_fence_are_named_as_such() -> None:
+    ways: list[tuple[Point, Point]] = [((0, 0), (FENCE_M, 0)), ((FENCE_M, 0), (0, 0.5))]
+    sentence = refusal(fleet(ways))
+    assert "(the target of v1 is only 0.50 m from this home), correct target_m" in sentence
+    assert "if they are interchangeable, set assign: nearest" in sentence
+
+
+@pytest.mark.parametrize(("away_m", "advice"), [
+    (3.0, "move its home nearer to the target, or set a larger fence"),
+    (27.0, "check home_m and target_m"),
+])  # fmt: skip
+def test_a_home_that_is_probably_wrong_needs_no_larger_fence(away_m: float, advice: str) -> None:
+    profile = base().with_({"safety.fence_radius_m": 2.0})
+    planned = fleet([((0, 0), (away_m, 0))])
+    planned = replace(planned, vehicles=(replace(planned.vehicles[0], profile=profile),))
+    assert refusal(planned).endswith(f"safety.fence_radius_m is 2 m: {advice}")
 
 
 def test_a_target_beyond_the_fence_is_refused() -> None:
