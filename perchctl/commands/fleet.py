@@ -243,7 +243,8 @@ def plan_text(plan: fleets.FleetPlan) -> str:
     """The plan as text: the room, which vehicles fly when and why some cannot fly together, and the
     radio."""
     schedule = plan.schedule
-    rows = [("order", f"group {n}: {', '.join(g)}") for n, g in enumerate(schedule.groups, 1)]
+    rows = [("nearest", sentence) for sentence in plan.reassigned]
+    rows += [("order", f"group {n}: {', '.join(g)}") for n, g in enumerate(schedule.groups, 1)]
     rows += [("not together", f"{c.first}, {c.second}: {c.why}") for c in schedule.conflicts]
     rows += [("first", f"{p.first} before {p.then}: {p.why}") for p in schedule.precedences]
     for load in plan.dongles:

@@ -63,6 +63,8 @@ def fly_fleet(plan: fleets.FleetPlan, settings: FleetSettings) -> int:
     options = fleets.flight_options(plan, folder, settings.seed, settings.record)
     for warning in fleets.warnings_before_fleet(options):
         say(f"check: {warning}")
+    for sentence in plan.reassigned:
+        say(f"assign: nearest: {sentence}")
     asks = not (settings.yes or all(each.simulated for each in options.values()))
     if asks and not sys.stdin.isatty():
         raise UsageError(

@@ -27,7 +27,10 @@ def assign_nearest(fleet: Fleet) -> Fleet:
     return replace(
         fleet,
         vehicles=tuple(
-            vehicle.with_target(other.target_m, other.profile.target)
+            replace(
+                vehicle.with_target(other.target_m, other.profile.target),
+                target_from="" if other is vehicle else other.name,
+            )
             for vehicle, other in zip(vehicles, targets, strict=True)
         ),
     )

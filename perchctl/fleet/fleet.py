@@ -45,6 +45,8 @@ class FleetVehicle:
         frame: the origin and axes of its state estimate. ``room``: those of the room, as with
             motion capture, Lighthouse or Loco. ``home``: the estimate is zero where the vehicle
             starts, as with a Flow deck or the target alone.
+        target_from: the vehicle to which the file gives this target, if ``assign: nearest`` has
+            assigned another vehicle's target; otherwise empty.
     """
 
     name: str
@@ -53,6 +55,7 @@ class FleetVehicle:
     target_m: Point
     heading_deg: float = 0.0
     frame: Frame = "home"
+    target_from: str = ""
 
     @property
     def uri(self) -> str:

@@ -48,6 +48,7 @@ class FleetPlan:
                     "frame": vehicle.frame,
                     "home_m": list(vehicle.home_m),
                     "target_m": list(vehicle.target_m),
+                    "target_from": vehicle.target_from or vehicle.name,
                     "heading_deg": vehicle.heading_deg,
                     "radius_m": round(corridor.radius_m, 3),
                     "way_top_m": corridor.way_top_m,
@@ -83,6 +84,16 @@ class FleetPlan:
                 for load in self.dongles
             ],
         }
+
+    @property
+    def reassigned(self) -> tuple[str, ...]:
+        """A sentence for each vehicle that ``assign: nearest`` has given another target than the
+        file."""
+        return tuple(
+            f"{v.name} flies to the target of {v.target_from}, {v.target_m[0]:g} {v.target_m[1]:g}"
+            for v in self.fleet.vehicles
+            if v.target_from
+        )
 
     def group_number(self, name: str) -> int:
         """The number of the group in which the vehicle flies, from 1."""

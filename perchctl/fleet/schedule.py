@@ -379,10 +379,11 @@ def _beyond_fence(vehicle: FleetVehicle, away_m: float, fleet: Fleet) -> str:
         )
         if _can_be_flown(assign_nearest(fleet)):
             advice.append("if they are interchangeable, set assign: nearest")
+    otherwise = "otherwise, " if advice else ""
     if away_m > FAR_M:
-        advice.append("check home_m and target_m")
+        advice.append(f"{otherwise}check home_m and target_m")
     else:
-        advice.append("move its home nearer to the target, or set a larger fence")
+        advice.append(f"{otherwise}move its home nearer to the target, or set a larger fence")
     return (
         f"the target of {vehicle.name} is {away_m:.2f} m from its home, and a draught can carry "
         f"the vehicle {WANDER_M:g} m farther, but safety.fence_radius_m is "
