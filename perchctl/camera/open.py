@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -72,13 +73,15 @@ class SourceName:
     @property
     def device(self) -> str:
         """Return the same text for all names of a connected camera (its number, its name, or a
-        path). If the camera is not connected, return the given text. Nothing is opened."""
+        path). If the camera is not connected, return the given text, but with its number instead of
+        a path such as /dev/video0. Nothing is opened."""
         if self.scheme != "camera":
             return str(self)
         try:
             return f"camera:{camera_number(self.place)}"
         except PerchError:
-            return str(self)
+            number = re.fullmatch(r"/dev/video([0-9]+)", self.place.strip())
+            return f"camera:{int(number[1])}" if number else str(self)
 
     def __str__(self) -> str:
         return without_password(self.spec)

@@ -163,7 +163,8 @@ def _vehicle(
     where = f"{path}: vehicle {clip_text(name) if isinstance(name, str) and name else number}"
     own_values, sections = _split(where, _Vehicle, entry)
     own: _Vehicle = _validated(where, _Vehicle, own_values)
-    layers = [*_layers(path, where, common, shared), *_layers(path, where, own, sections)]
+    defaults = [*_layers(path, f"{path}: defaults", common, shared)]
+    layers = [*defaults, *_layers(path, where, own, sections)]
     if own.body is not None:
         layers.append({"positioning": {"body": own.body}})
     if own.target_m is not None:
@@ -174,6 +175,8 @@ def _vehicle(
         profile = layered_profile(path, profile_name, *layers)
     except PerchError as error:
         reason = str(error).removeprefix(f"{path}: ").replace("extends: ", "profile: ", 1)
+        if own.profile is None and _fails_alike(path, profile_name, defaults, error):
+            where = f"{path}: defaults"
         raise type(error)(f"{where}: {reason}") from None
     profile = _with_own_body(profile, own.name)
     vehicle = FleetVehicle(
@@ -184,8 +187,19 @@ def _vehicle(
         heading_deg=next((h for h in (own.heading_deg, common.heading_deg) if h is not None), 0.0),
         frame=own.frame or common.frame or default_frame(profile),
     )
-    _check(where, vehicle)
+    _check(path, where, vehicle, own, common)
     return vehicle.with_target(_target_place(where, vehicle, own.target_m))
+
+
+def _fails_alike(
+    path: Path, profile_name: str, defaults: Sequence[dict[str, Any]], error: PerchError
+) -> bool:
+    """True if the keys under `defaults` alone, without those of a vehicle, give the same error."""
+    try:
+        layered_profile(path, profile_name, *defaults)
+    except PerchError as alone:
+        return str(alone) == str(error)
+    return False
 
 
 def default_frame(profile: Profile) -> Frame:
@@ -222,9 +236,15 @@ def _with_own_body(profile: Profile, name: str) -> Profile:
     return profile.model_copy(update={"positioning": positioning.model_copy(update={"body": name})})
 
 
-def _check(where: str, vehicle: FleetVehicle) -> None:
+def _check(path: Path, where: str, vehicle: FleetVehicle, own: _Vehicle, common: _Common) -> None:
     """Raise InvalidValue for a frame, a URI or a camera source with which the vehicle could not
     fly."""
+
+    def at(name: str) -> str:
+        """The place in the file at which the vehicle got this key."""
+        is_common = getattr(own, name) is None and getattr(common, name) is not None
+        return f"{path}: defaults" if is_common else where
+
     positioning, uri = vehicle.profile.positioning, vehicle.uri
     only = default_frame(vehicle.profile)
     if vehicle.frame != only and not positioning.source.is_deck:
@@ -238,12 +258,14 @@ def _check(where: str, vehicle: FleetVehicle) -> None:
             f"estimate uses {axes}: write {only}, or leave it out"
         )
     try:
+        key = "uri"
         if not is_own_uri(uri):
             # A dongle is added later to a URI that has none, as written by cfcli.
             check_uri(uri.replace("radio:///", "radio://0/", 1))
+        key = "source"
         source = parse_source(vehicle.source)
     except PerchError as error:
-        raise type(error)(f"{where}: {error}") from None
+        raise type(error)(f"{at(key)}: {error}") from None
     if not vehicle.simulated and (source.scheme == "sim" or not source.live):
         raise InvalidValue(
             f"{where}: camera source {source} is not a live camera, but {uri} is a real vehicle: "
@@ -273,8 +295,8 @@ def _refuse_shared(path: Path, vehicles: Sequence[FleetVehicle]) -> None:
         (lambda v: v.name.lower(), "share the name {0}: give each vehicle its own name"),
         (
             _address,
-            "share the address {0}: give each vehicle its own address, in Bitcraze's client and in "
-            "its uri",
+            "share the address of {uris}: give each vehicle its own address, in Bitcraze's client "
+            "and in its uri",
         ),
         (_camera, "share the camera {0}: give each vehicle its own source"),
         (_body, "share the motion-capture body {0}: give each vehicle its own body"),
@@ -289,7 +311,8 @@ def _refuse_shared(path: Path, vehicles: Sequence[FleetVehicle]) -> None:
                 first, other = seen[value]
                 same = other.name.lower() == vehicle.name.lower()
                 who = f"{first} and {number}" if same else f"{other.name} and {vehicle.name}"
-                raise InvalidValue(f"{path}: vehicles {who} {words.format(value)}")
+                uris = " and ".join(dict.fromkeys((other.uri, vehicle.uri)))
+                raise InvalidValue(f"{path}: vehicles {who} {words.format(value, uris=uris)}")
             seen[value] = number, vehicle
 
 

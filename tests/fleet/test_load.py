@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from perchctl.camera import device
+from perchctl.commands.fleet import plan_text
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.fleet import load_fleet
+from perchctl.fleet import load_fleet, make_plan
 from perchctl.fleet.fleet import Fleet
 from perchctl.profile import load_profile
 
@@ -134,6 +135,21 @@ def test_files_are_named_from_the_fleet_file_s_folder(
     assert [v.profile.safety.max_height_m for v in fleet.vehicles] == [2.5, 3.0]
 
 
+def test_a_plan_says_which_targets_were_reassigned(tmp_path: Path) -> None:
+    crossed = two().replace("[0.2, 0]", "TEMP").replace("[3.2, 0]", "[0.2, 0]")
+    text = f"assign: nearest\n{crossed.replace('TEMP', '[3.2, 0]')}"
+    plan = make_plan(load(tmp_path, text))
+    assert plan.reassigned == (
+        "north flies to the target of east, 0.2 0",
+        "east flies to the target of north, 3.2 0",
+    )
+    assert [each["target_from"] for each in plan.record()["vehicles"]] == ["east", "north"]
+    assert "nearest       north flies to the target of east" in plan_text(plan)
+    unchanged = make_plan(load(tmp_path, f"assign: nearest\n{two()}"))
+    assert unchanged.reassigned == ()
+    assert [each["target_from"] for each in unchanged.record()["vehicles"]] == ["north", "east"]
+
+
 def test_interchangeable_targets_go_to_the_nearest_with_their_markers(tmp_path: Path) -> None:
     crossed = two().replace("[0.2, 0]", "TEMP").replace("[3.2, 0]", "[0.2, 0]")
     marked = crossed.replace("TEMP", "[3.2, 0], target: east.yaml")
@@ -196,7 +212,25 @@ REFUSED = [
     (two().replace("east", "north"), "vehicles 1 and 2 share the name north: give each "),
     (
         two(RADIO.format("01", 0), RADIO.format("01", 1).replace("//0", "//1")),
-        "vehicles north and east share the address radio/80/2M/E7E7E7E701: give each vehicle",
+        "vehicles north and east share the address of radio://0/80/2M/E7E7E7E701 and "
+        "radio://1/80/2M/E7E7E7E701: give each vehicle its own address",
+    ),
+    (
+        two(RADIO.format("01", 0), RADIO.format("01", 1)),
+        "vehicles north and east share the address of radio://0/80/2M/E7E7E7E701: give each",
+    ),
+    (
+        two(RADIO.format("01", 0), RADIO.format("02", "/dev/video0")),
+        "vehicles north and east share the camera camera:0: give each vehicle its own source",
+    ),
+    (two(defaults="").replace("sim}", "smi}"), "defaults: profile: profile 'smi' not found; give"),
+    (two(defaults=", safety: {fence_radius_m: -1}"), "defaults: safety.fence_radius_m: must be"),
+    (two(defaults=", target: none.yaml"), "defaults: target: "),
+    (two(defaults=", uri: radio://0/80/3M/E7"), f"defaults: {BAD_URI}"),
+    (two(defaults=", source: 'camra:0'"), "defaults: camera source 'camra:0' is unknown"),
+    (
+        two(", safety: {fence_radius_m: -2}", defaults=", safety: {fence_radius_m: -1}"),
+        "vehicle north: safety.fence_radius_m: must be above 0, found -2",
     ),
     (
         two(RADIO.format("01", 0), RADIO.format("02", 0)),
