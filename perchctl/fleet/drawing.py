@@ -34,8 +34,8 @@ _PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 def draw_text(fleet: Fleet, groups: tuple[tuple[str, ...], ...] = ()) -> str:
     """The room in at most 80 columns: a map, and a line for each vehicle.
 
-    On the map, ``N`` is the home of vehicle number N and ``N*`` its target; ``.`` marks a place in
-    one corridor, ``#`` a place in several.
+    On the map, ``N`` is the home of vehicle number N and ``N*`` its target, or both if its home is
+    directly below its target; ``.`` marks a place in one corridor, ``#`` a place in several.
     """
     corridors = _corridors(fleet)
     low, high = _bounds(corridors)
@@ -55,16 +55,30 @@ def draw_text(fleet: Fleet, groups: tuple[tuple[str, ...], ...] = ()) -> str:
         for r in range(rows)
     ]
 
-    def write(place: Point, text: str) -> None:
+    def cell(place: Point) -> tuple[int, int]:
         row = min(rows - 1, int((high[1] - place[1]) / (cell_m * CELL_ASPECT)))
-        column = min(columns - len(text), int((place[0] - low[0]) / cell_m))
-        cells[row][column : column + len(text)] = text
+        return row, min(columns - 1, int((place[0] - low[0]) / cell_m))
+
+    def write(at: tuple[int, int], text: str) -> None:
+        """Write the text at the nearest place in the row where it covers no other text."""
+        row, wanted = at
+        starts = range(columns - len(text) + 1)
+        free = (s for s in starts if set(cells[row][s : s + len(text)]) <= {" ", INSIDE, OVERLAP})
+        start = min(free, key=lambda s: abs(s - wanted), default=min(wanted, starts[-1]))
+        cells[row][start : start + len(text)] = text
 
     for number, vehicle in enumerate(fleet.vehicles, 1):
-        write(vehicle.target_m, f"{number}*")
-        write(vehicle.home_m, f"{number}")
+        home, target = cell(vehicle.home_m), cell(vehicle.target_m)
+        if home != target:
+            write(home, f"{number}")
+        write(target, f"{number}*")
     lines = ["".join(row).rstrip() for row in cells]
-    lines += [f"{width_m:.1f} by {height_m:.1f} m; x to the right, y up", ""]
+    lines += [
+        f"{width_m:.1f} by {height_m:.1f} m; x to the right, y up",
+        "1 home, 1* target (or both, if they are in the same place)",
+        f"{INSIDE} in one corridor, {OVERLAP} in several",
+        "",
+    ]
     for line in _legend(fleet, corridors, groups):
         lines += textwrap.wrap(line, DRAWING_COLUMNS, subsequent_indent="   ", drop_whitespace=True)
     return "\n".join(lines)
@@ -99,13 +113,14 @@ def _ordinal(number: int) -> str:
 
 
 def draw_svg(fleet: Fleet, groups: tuple[tuple[str, ...], ...] = ()) -> str:
-    """Return the room as an SVG picture: corridors as wide lines with round ends, homes as squares,
-    and targets as crosses."""
+    """Return the room as an SVG picture: corridors as wide lines with round ends, homes as circles,
+    and targets as squares, as in the film."""
     corridors = _corridors(fleet)
     low, high = _bounds(corridors)
     scale = _SVG_WIDTH_PX / (high[0] - low[0])
     map_px = (high[1] - low[1]) * scale
-    legend = _legend(fleet, corridors, groups)
+    symbols = "circle: home; square: target; wide line: corridor"
+    legend = [symbols, *_legend(fleet, corridors, groups)]
     height_px = map_px + _LEGEND_ROW_PX * (len(legend) + 1)
 
     def at(place: Point) -> Point:
@@ -125,9 +140,9 @@ def draw_svg(fleet: Fleet, groups: tuple[tuple[str, ...], ...] = ()) -> str:
             f'<line {line} stroke-opacity="0.2" stroke-linecap="round" '
             f'stroke-width="{2 * corridor.radius_m * scale:.1f}"/>',
             f'<line {line} stroke-width="1.5" stroke-dasharray="5 4"/>',
-            f'<rect x="{x - 5:.1f}" y="{y - 5:.1f}" width="10" height="10" fill="{colour}"/>',
-            f'<path d="M{u - 6:.1f} {v - 6:.1f}l12 12m0 -12l-12 12" stroke="{colour}" '
-            f'stroke-width="2.5"/>',
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="{colour}"/>',
+            f'<rect x="{u - 6:.1f}" y="{v - 6:.1f}" width="12" height="12" fill="none" '
+            f'stroke="{colour}" stroke-width="2.5"/>',
             f'<text x="{x + 9:.1f}" y="{y + 5:.1f}">{number + 1} {escape(vehicle.name)}</text>',
         ]
     metre_y = map_px - 12
@@ -135,10 +150,11 @@ def draw_svg(fleet: Fleet, groups: tuple[tuple[str, ...], ...] = ()) -> str:
         f'<path d="M12 {metre_y:.1f}h{scale:.1f}" stroke="black" stroke-width="2"/>'
         f'<text x="12" y="{metre_y - 6:.1f}">1 m</text>'
     )
+    colours = ["black", *(_PALETTE[n % len(_PALETTE)] for n in range(len(fleet.vehicles)))]
     parts += [
         f'<text x="12" y="{map_px + _LEGEND_ROW_PX * (row + 1):.1f}" '
-        f'fill="{_PALETTE[row % len(_PALETTE)]}">{escape(text.strip())}</text>'
-        for row, text in enumerate(legend)
+        f'fill="{colour}">{escape(text.strip())}</text>'
+        for row, (text, colour) in enumerate(zip(legend, colours, strict=True))
     ]
     return "\n".join([*parts, "</svg>", ""])
 
