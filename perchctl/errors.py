@@ -6,7 +6,9 @@ and the README. Each message says in one sentence what was found, what is allowe
 
 from __future__ import annotations
 
+import difflib
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass
 from decimal import Decimal
 
@@ -144,6 +146,13 @@ class ReplayDiffers(PerchError):
 class Interrupted(PerchError):
     exit_code = 130
     meaning = "interrupted by Ctrl-C: landed, or left on the ground or hanging"
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return a question about the known name that is most similar to an unknown one, with a space
+    after it; empty if none is similar."""
+    close = difflib.get_close_matches(name, list(known), 1)
+    return f"did you mean {close[0]}? " if close else ""
 
 
 def require_type(name: str, value: object, *kinds: type) -> None:

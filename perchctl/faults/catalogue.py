@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from perchctl.errors import InvalidValue
+from perchctl.errors import InvalidValue, did_you_mean
 from perchctl.faults import effects as e
 from perchctl.geometry import GRAVITY_MPS2, rot_z
 from perchctl.mission import Phase
@@ -581,6 +581,10 @@ class Case:
         begins = f"{self.moment_s:.1f} s after {self.phase.value} began"
         if self.fault.phases == FROM_THE_START:
             begins = "from the start"
+        return self.text_at(begins)
+
+    def text_at(self, begins: str) -> str:
+        """The fault and the values drawn for it, in words, with another text for its time."""
         drawn = "; ".join(map(_effect_text, self.effects))
         return f"{self.fault.name}, {begins}: {self.fault.description} ({drawn})"
 
@@ -613,8 +617,9 @@ def select_faults(names: str) -> tuple[Fault, ...]:
     found = []
     for name in (part.strip() for part in names.split(",")):
         if name not in BY_NAME:
+            meant = did_you_mean(name, BY_NAME)
             raise InvalidValue(
-                f"fault {name!r} is unknown; `--faults list` lists all {len(FAULTS)}"
+                f"fault {name!r} is unknown; {meant}`--faults list` lists all {len(FAULTS)}"
             )
         found.append(BY_NAME[name])
     return tuple(found)

@@ -30,7 +30,7 @@ import numpy as np
 
 from perchctl.campaign import run_measured
 from perchctl.corridor import Point
-from perchctl.errors import ConnectionFailed, InvalidValue
+from perchctl.errors import ConnectionFailed, InvalidValue, did_you_mean
 from perchctl.faults import (
     COMMON_CAUSES,
     FAULTS,
@@ -92,7 +92,8 @@ def select_fleet_faults(names: str) -> tuple[str, ...]:
     found = [part.strip() for part in names.split(",")]
     unknown = next((name for name in found if name not in {*_FAULT_BY_NAME, *_CAUSE_BY_NAME}), None)
     if unknown is not None:
-        raise InvalidValue(f"fault {unknown!r} is unknown; `--faults list` lists all")
+        meant = did_you_mean(unknown, (*_FAULT_BY_NAME, *_CAUSE_BY_NAME))
+        raise InvalidValue(f"fault {unknown!r} is unknown; {meant}`--faults list` lists all")
     return tuple(found)
 
 
@@ -111,6 +112,14 @@ class Trouble:
     cases: dict[str, Case]
     group: int = 0
     at_s: float | None = None
+
+    @property
+    def texts(self) -> dict[str, str]:
+        """What is injected into each affected vehicle, in words."""
+        if self.at_s is None:
+            return {name: case.text for name, case in self.cases.items() if case.text is not None}
+        begins = f"{self.at_s:.1f} s after group {self.group + 1} started"
+        return {name: case.text_at(begins) for name, case in self.cases.items()}
 
 
 def draw_trouble(
@@ -284,6 +293,7 @@ class FleetFlight:
             least_distance_in_air_m=_finite(room.least_both_m),
             separation_m=self._plan.separation_m,
             time_s=self._clock.t_s,
+            injected=self._trouble.texts,
         )
 
     def _fly_group(self, names: Sequence[str], number: int) -> None:

@@ -3,8 +3,9 @@ text."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from perchctl.campaign import CampaignFlight, align_columns, rate_text
@@ -12,7 +13,8 @@ from perchctl.faults import ENDS, FLAGS, HEALTHY, FaultResult, fault_summary
 
 _FROM_GOOD_TO_BAD = ("perched", "landed", "refused", "aborted", "failed", "gone")
 WORST_FLEETS = 10
-"""How many of the worst fleets the text names."""
+"""How many of the worst fleets the text names. If no more were flown, it lists all injected
+faults."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,8 @@ class FleetResult(CampaignFlight):
             of both were turning; None if no two vehicles had their motors running at the same time.
         separation_m: the plan's separation between the corridors of two vehicles that fly together.
         time_s: time from the start of the first group to the end of the last one.
+        injected: what was to be injected into each affected vehicle, in words. The `begin_s` of its
+            result says whether the fault began.
     """
 
     fault: str
@@ -41,6 +45,7 @@ class FleetResult(CampaignFlight):
     least_distance_in_air_m: float | None
     separation_m: float
     time_s: float
+    injected: dict[str, str] = field(default_factory=dict)
 
     @property
     def is_bad(self) -> bool:
@@ -90,6 +95,12 @@ def fleet_summary(results: Sequence[FleetResult]) -> dict[str, Any]:
         "least_distance_in_air_m": _least([r.least_distance_in_air_m for r in results]),
         "separation_m": results[0].separation_m if results else None,
         "worst_seeds": [r.seed for r in worst_fleets(results)[:WORST_FLEETS]],
+        "injected": [
+            {"seed": r.seed, "vehicle": name, "fault": text, "begin_s": vehicle.begin_s}
+            for r in results
+            for name, vehicle in zip(r.names, r.vehicles, strict=True)
+            if (text := r.injected.get(name)) is not None
+        ],
     }
 
 
@@ -120,10 +131,25 @@ def fleet_table(results: Sequence[FleetResult]) -> str:
         if (least_m := figures[name]) is not None:
             lines.append(f"{'least distance':<22}{least_m:.2f} m between two vehicles, {words}")
     wrong = sum(vehicle.is_bad for fleet in results for vehicle in fleet.vehicles)
-    lines.append(f"{'with a flag':<22}{wrong} vehicles; {figures['unavoidable']} unavoidable")
+    unavoidable = figures["unavoidable"]
+    lines.append(
+        f"{'with a flag':<22}{wrong} vehicle{'' if wrong == 1 else 's'}; excused by physics or the "
+        f"firmware: {unavoidable}"
+    )
     for flag, meaning in FLAGS.items():
         if figures[flag]:
             lines.append(f"{flag.replace('_', ' '):<22}{figures[flag]}: {meaning}")
+    # The results file names the faults of every seed; the text does so for a few seeds only.
+    if figures["injected"] and len(results) <= WORST_FLEETS:
+        lines += ["", "injected faults"]
+        for each in figures["injected"]:
+            not_begun = "" if each["begin_s"] is not None else "; did not begin"
+            lines += textwrap.wrap(
+                f"seed {each['seed']}, {each['vehicle']}: {each['fault']}{not_begun}",
+                width=80,
+                subsequent_indent="   ",
+                break_on_hyphens=False,
+            )
     if worst := worst_fleets(results)[:WORST_FLEETS]:
         lines += ["", "worst fleets"]
         rows: list[tuple[str, ...]] = [("seed", "fault", "vehicle", "end", "what")]

@@ -8,7 +8,6 @@ larger sections.
 from __future__ import annotations
 
 import datetime
-import difflib
 from collections.abc import Collection, Mapping, Sequence
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -16,7 +15,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic.fields import FieldInfo
 
-from perchctl.errors import InvalidValue, require_type
+from perchctl.errors import InvalidValue, did_you_mean, require_type
 from perchctl.plain_yaml import clip_text, value_text
 from perchctl.profile.base import Section, key, split_constant_keys
 from perchctl.profile.limits import IMPOSSIBLE
@@ -271,8 +270,7 @@ def _description(model: Any, loc: tuple[int | str, ...]) -> str:
 def nearest_names(name: str, allowed: Collection[str]) -> str:
     """Return the end of a message about an unknown name: the most similar one of `allowed`, and all
     of them."""
-    close = difflib.get_close_matches(name, allowed, 1)
-    return f"{f'did you mean {close[0]}? ' if close else ''}allowed here are {', '.join(allowed)}"
+    return f"{did_you_mean(name, allowed)}allowed here are {', '.join(allowed)}"
 
 
 def _field_at(model: Any, names: Sequence[str]) -> FieldInfo:

@@ -109,6 +109,8 @@ def test_a_key_that_is_held_is_no_stop_and_one_that_is_hammered_is(name: str, st
 def test_a_selection_by_name() -> None:
     assert select_faults("all") == FAULTS
     assert [fault.name for fault in select_faults("hung, killed")] == ["hung", "killed"]
+    with pytest.raises(InvalidValue, match=r"unknown; did you mean kick\? `--faults list` lists"):
+        select_faults("kik")
     with pytest.raises(InvalidValue, match=r"'hanged' is unknown.*--faults list"):
         select_faults("killed,hanged")
     assert {draw_case(seed, SCENARIO, select_faults("slow")).fault.name for seed in range(5)} == {

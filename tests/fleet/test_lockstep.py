@@ -18,7 +18,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.errors import ConnectionFailed, UsageError
+from perchctl.errors import ConnectionFailed, InvalidValue, UsageError
 from perchctl.faults import FAULTS, HEALTHY, Case, FaultResult, FaultyFlight
 from perchctl.faults.effects import FOR_EVER, external_positions
 from perchctl.fleet import (
@@ -444,7 +444,34 @@ def test_figures_count_fleets_and_vehicles() -> None:
     assert "collided" in text
     assert "0.10 m between two vehicles, flying" in text
     assert "fell                  1: fell" in text
+    assert "with a flag           1 vehicle; excused by physics or the firmware: 0" in text
     assert json.loads(json.dumps(fleet_summary([]))) == fleet_summary([])
+
+
+def test_each_injected_fault_is_named_with_its_vehicle() -> None:
+    began, not_begun = (replace(made().vehicles[0], begin_s=s) for s in (3.0, None))
+    result = made(vehicles=(began, not_begun), injected={"a": "stall, at once", "b": "kick"})
+    named = fleet_summary([result])["injected"]
+    assert named == [
+        {"seed": 5, "vehicle": "a", "fault": "stall, at once", "begin_s": 3.0},
+        {"seed": 5, "vehicle": "b", "fault": "kick", "begin_s": None},
+    ]
+    lines = fleet_table([result]).splitlines()
+    assert "seed 5, a: stall, at once" in lines
+    assert "seed 5, b: kick; did not begin" in lines
+    assert "injected faults" not in fleet_table([result] * 11)
+
+
+@pytest.mark.parametrize("fault", ["kick", "dongle-dies"])
+def test_a_result_says_what_was_injected(stage: Stage, fault: str) -> None:
+    plan = make_plan(row(2))
+    trouble = draw_trouble(plan, place_fleet(plan.fleet, 1), [fault], 3)
+    injected = fly(plan.fleet, trouble).injected
+    assert injected.keys() == trouble.cases.keys()
+    moment = "began" if fault == "kick" else f"{trouble.at_s:.1f} s after group "
+    for text in injected.values():
+        assert text.startswith(f"{fault}, ")
+        assert moment in text
 
 
 def test_a_result_is_written_and_read_back() -> None:
@@ -466,6 +493,8 @@ def test_faults_are_chosen_by_name() -> None:
     assert len(select_fleet_faults("all")) == len(FAULTS) + 4
     assert select_fleet_faults("kick, stall") == ("kick", "stall")
     assert HEALTHY.fault.name not in select_fleet_faults("all")
+    with pytest.raises(InvalidValue, match=r"'dongle-dis' is unknown; did you mean dongle-dies\? "):
+        select_fleet_faults("dongle-dis")
     done = run("fleet", "simulate", "--faults", "none")
     assert done.code == 30
     assert done.complaint.startswith("fault 'none' is unknown")
