@@ -25,6 +25,7 @@ from perchctl.check.row import (
 from perchctl.errors import PerchError, SafetyAbort
 from perchctl.files import check_writable
 from perchctl.flight import FlyOptions
+from perchctl.link import vehicle_uri
 from perchctl.places import is_shipped_example
 from perchctl.profile import DOUBTFUL, Profile, find_calibration
 from perchctl.target import mm_text, sees_small_marker
@@ -35,15 +36,18 @@ LOOKS_UP = math.cos(math.radians(45.0))
 ceiling."""
 
 
-def profile_rows(profile: Profile, *, source: str | None = None) -> list[Row]:
+def profile_rows(
+    profile: Profile, *, source: str | None = None, uri: str | None = None
+) -> list[Row]:
     """Return a row for each check of the profile, the most important first.
 
-    `source` replaces the profile's camera source. Opens no link and no camera; reads the
-    calibration file. Raises nothing.
+    `source` and `uri` replace the profile's camera source and the vehicle's URI. Opens no link and
+    no camera; reads the calibration file. Raises nothing.
     """
     plan = _Plan(profile, profile.camera.source if source is None else source)
     rows = evaluate_rows(JUDGES, plan)
     rows += [evaluate_row(name, _limits, name, profile) for name in DOUBTFUL]
+    rows += _short_address_rows(profile.link.uri if uri is None else uri)
     if profile.positioning.source.is_target:
         rows.append(evaluate_row("latency", _latency, plan))
     return rows
@@ -53,7 +57,7 @@ def offline_rows(options: FlyOptions) -> list[Row]:
     """The rows about the computer's disk and the profile, without opening a link or camera."""
     return [
         evaluate_row("log folder", log_finding, options.log_dir),
-        *profile_rows(options.profile, source=options.source),
+        *profile_rows(options.profile, source=options.source, uri=options.uri),
     ]
 
 
@@ -88,6 +92,18 @@ class _Plan:
             return profile_camera(self.profile.camera)
         except PerchError as error:
             raise Unanswerable(f"no calibration: {error}") from None
+
+
+def _short_address_rows(uri: str) -> list[Row]:
+    """Return a row for a radio URI whose address is too short: cflib puts zeros before it."""
+    parts = uri.partition("?")[0].split("/")
+    if parts[0] != "radio:" or len(parts) < 6:
+        return []
+    whole = vehicle_uri(uri).rpartition("/")[2]
+    if not 0 < len(parts[5]) < len(whole):
+        return []
+    advice = "write all ten digits of the address"
+    return [Row("short address", *warned(f"{uri} means the address {whole}", advice))]
 
 
 def _calibration(plan: _Plan) -> Finding:

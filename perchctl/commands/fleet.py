@@ -56,7 +56,7 @@ PICTURE = "a drawing of the room"
 
 FleetArgument = Annotated[
     str | None,
-    typer.Argument(metavar="[FLEET.yaml]", help="Fleet file. Default: four simulated vehicles."),
+    typer.Argument(metavar="FLEET.yaml", help="Fleet file. Default: four simulated vehicles."),
 ]
 PictureOption = Annotated[
     Path | None,
@@ -108,6 +108,10 @@ def check(
         plan = fleets.make_plan(loaded)
     except InvalidValue as error:
         refusal = InvalidValue(f"{loaded.path}: {error}")
+    for vehicle in loaded.vehicles:
+        for row in checks.profile_rows(vehicle.profile):
+            if row.name == "short address":
+                say(f"{vehicle.name}: {row.found}: {row.advice}")
     groups = plan.schedule.groups if plan is not None else ()
     if output is not None:
         write_files({output: fleets.draw_svg(loaded, groups).encode()})

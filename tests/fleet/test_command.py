@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -115,6 +116,19 @@ def test_the_map_has_each_home_and_target_where_it_is() -> None:
     assert at["4*"][1] < at["1*"][1] < at["2*"][1], "x is to the right"
 
 
+def test_each_label_of_the_list_is_on_the_map_whole() -> None:
+    """Also where a home and a target, or the targets of two vehicles, are side by side."""
+    close = fleet([((0.0, 0.0), (-0.03, 0.0)), ((0.1, 0.0), (0.0, 0.0)), ((3.0, 0.0), (3.0, 0.0))])
+    lines = draw_text(close).splitlines()
+    drawn = lines[: next(n for n, line in enumerate(lines) if "x to the right" in line)]
+    found = re.findall(r"\d\*?", "\n".join(drawn))
+    assert sorted(found) == ["1", "1*", "2", "2*", "3*"], (
+        "a home below its own target has one label"
+    )
+    assert "1 home, 1* target (or both, if they are in the same place)" in lines
+    assert ". in one corridor, # in several" in lines
+
+
 def test_many_vehicles_on_one_spot_can_be_drawn() -> None:
     crowd = fleet([((0.0, 0.0), (0.0, 0.0))] * 12)
     assert max(map(len, draw_text(crowd).splitlines())) <= 80
@@ -133,3 +147,17 @@ def test_the_picture_is_an_svg_of_all_vehicles() -> None:
     words = " ".join(node.text or "" for node in root.iter() if node.tag.endswith("text"))
     assert all(vehicle.name in words for vehicle in planned.vehicles)
     assert "flies 2nd" in words
+    assert "circle: home; square: target; wide line: corridor" in words
+    shapes = [node.tag.rpartition("}")[2] for node in root.iter()]
+    assert (shapes.count("circle"), shapes.count("rect")) == (4, 5), "one is the background"
+
+
+def test_a_short_address_is_named_in_full(tmp_path: Path) -> None:
+    path = tmp_path / "short.yaml"
+    path.write_text(
+        "vehicles:\n  - {name: a, uri: 'radio://0/80/2M/E7E7E7', source: 'camera:0', "
+        "home_m: [0, 0], target_m: [0, 0]}\n"
+    )
+    done = run("fleet", str(path))
+    assert done.code == 0
+    assert "a: radio://0/80/2M/E7E7E7 means the address 0000E7E7E7: write all ten" in done.stderr
