@@ -158,6 +158,15 @@ def test_each_help_is_whole_at_80_columns(name: str) -> None:
         assert "Examples:\n    perchctl " in text
 
 
+def test_the_help_of_a_main_subcommand_begins_with_its_own_sentence() -> None:
+    for name, begins in (("fleet check", "Plan a fleet's flight"), ("log show", "Show how and")):
+        done = run(*name.split(), "--help")
+        assert done.stdout.splitlines()[2].strip().startswith(begins)
+        assert "By default (subcommand" in done.stdout or name != "fleet check"
+    usage = run("fleet", "check", "--help").stdout.splitlines()[0]
+    assert usage.endswith("fleet check [OPTIONS] [FLEET.yaml]")
+
+
 def test_fly_help_lists_every_exit_code_in_a_line() -> None:
     text = run("fly", "--help").stdout
     lines = text.splitlines()

@@ -4,6 +4,7 @@ sentences."""
 from __future__ import annotations
 
 import contextlib
+import copy
 import difflib
 import errno
 import functools
@@ -97,6 +98,17 @@ class Group(TyperGroup):
                 )
             args = [next(iter(self.commands)), *args]
         return super().parse_args(ctx, args)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a subcommand. The help of the main one, if the user names it, begins with its own
+        sentence instead of the group's."""
+        found = super().get_command(ctx, cmd_name)
+        if found is None or cmd_name != next(iter(self.commands)) or not found.short_help:
+            return found
+        _, _, rest = (found.help or "").partition("\n\n")
+        named = copy.copy(found)
+        named.help = f"{found.short_help}\n\n{rest}".rstrip()
+        return named
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help text of the main subcommand, followed by a list of the others."""
