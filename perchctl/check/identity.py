@@ -278,7 +278,10 @@ def _undetected_finding(view: View, expected_m: Point) -> Finding:
             "make-target design",
         )
     where = overhead_text(profile.target, view.calibrated, profile.camera.mount)
-    return failed("its target is not detected", f"move home_m closer to the target: {where}")
+    return failed(
+        "its target is not detected",
+        f"put the vehicle nearer to its target and correct home_m: {where}",
+    )
 
 
 def _covered_finding(view: View, before: Rehearsal, ask: Ask, why: str) -> Finding:

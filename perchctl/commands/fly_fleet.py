@@ -246,7 +246,7 @@ class FleetSession:
 
         self._switch.listening = True
         has_keys = stack.enter_context(flights.cut_key(self._switch, stdin_number(), on_keys))
-        one = f"Press 1 to {self._keys} to land one."
+        one = f"Press {self._keys_text} to land {'it' if self._keys == 1 else 'one vehicle'}."
         help_lines = flights.STOP_HELP, f"{flights.KEY_HELP} {one}" if has_keys else ""
         print_lines("\n".join(filter(None, help_lines)))
         self._panel = displays.FleetPanel(sys.stderr, help_lines)
@@ -265,11 +265,15 @@ class FleetSession:
         """The number of vehicles that can be landed by a key."""
         return min(len(self._options), NUMBER_KEYS)
 
+    @property
+    def _keys_text(self) -> str:
+        return {1: "1", 2: "1 or 2"}.get(self._keys, f"a key from 1 to {self._keys}")
+
     def _land_by_key(self, coordinator: fleets.Coordinator, number: int) -> str:
         """Land the vehicle with this number at once; return the reply to the operator. Called in
         the keyboard thread, which must not be blocked."""
         if not 1 <= number <= self._keys:
-            return f"no vehicle is assigned to key {number}: press 1 to {self._keys} to land one"
+            return f"no vehicle is assigned to key {number}: press {self._keys_text} to land one"
         return self._land_one(coordinator, number, f"key {number}")
 
     def _land_one(self, coordinator: fleets.Coordinator, number: int, how: str) -> str:

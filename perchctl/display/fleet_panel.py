@@ -17,6 +17,7 @@ from perchctl.display.terminal import (
     frame_table,
     phase_style,
 )
+from perchctl.mission import Phase
 
 _WIDTHS = {"": 2, "name": 10, "phase": 8, "height": 7, "error": 8, "battery": 7, "link": 6}
 _REASON_COLUMNS = PANEL_COLUMNS - 4 - sum(_WIDTHS.values()) - len(_WIDTHS)
@@ -50,10 +51,12 @@ class FleetRow:
     picture_port: int | None = None
 
     def texts(self) -> tuple[str, str, str, str]:
-        """Height, error, battery and link; empty if unknown."""
+        """Height, error, battery and link; empty if unknown. For a vehicle that hangs, the error is
+        left out: its camera no longer measures how far the gear is from the centre."""
+        is_hanging = self.hangs or self.phase == Phase.PERCHED.value
         return (
             "" if self.height_m is None else f"{self.height_m:.2f} m",
-            "" if self.error_m is None else f"{100.0 * self.error_m:.1f} cm",
+            "" if self.error_m is None or is_hanging else f"{100.0 * self.error_m:.1f} cm",
             "" if self.battery_v is None else f"{self.battery_v:.2f} V",
             "" if self.link_s is None else age_text(self.link_s),
         )

@@ -251,7 +251,8 @@ class StatusReporter(Watcher):
         """`FlightParts.may_take_off`: the parent's permission."""
         self._line.note_turn()
         stage = Stage.CHECKING if waiting else Stage.READY
-        self._line.tell(Status(stage=stage, reason=waiting, picture_port=self._picture_port))
+        reason = f"waiting for {waiting}" if waiting else ""
+        self._line.tell(Status(stage=stage, reason=reason, picture_port=self._picture_port))
         return self._switch.may_take_off
 
     def tick(self, tick: Tick) -> None:

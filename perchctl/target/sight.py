@@ -123,10 +123,11 @@ def overhead_text(target: TargetConfig, camera: CameraModel, mount: Mounting) ->
     reaches = [(h, overhead_reach_m(side_m, camera, mount, h)) for h in heights_m]
     within = [f"{r:.2g} m (at {h:.2g} m above it)" for h, r in reaches if r is not None]
     if not within:
-        return f"visible only to a camera that looks up; the axis of this one {axis}"
+        only = "the large marker is visible only to a camera that looks up"
+        return f"{only}; the axis of this one {axis}"
     return (
-        f"at most {highest_m:.1f} m above the camera, with its centre within "
-        f"{', '.join(within)} of the camera's axis, which {axis}"
+        f"the large marker is found at most {highest_m:.1f} m above the camera, with its centre "
+        f"within {', '.join(within)} of the camera's axis, which {axis}"
     )
 
 

@@ -62,7 +62,10 @@ def test_a_page_that_is_opened_in_mid_flight_shows_what_has_been(fleet_page: Fle
     state = state_of(fleet_page)
     assert state["events"] == ["north: SEARCH", "north: ALIGN", "north: RECOVER"]
     assert state["vehicles"][0]["reached"] == state["steps"].index("ALIGN")
-    fleet_page.show([row(1, "north", "hangs", hangs=True, has_ended=True)])
+    fleet_page.show([row(1, "north", Phase.PERCHED.value, error_m=0.023)])
+    assert state_of(fleet_page)["vehicles"][0]["values"][1] == ""
+    fleet_page.show([row(1, "north", "hangs", hangs=True, has_ended=True, error_m=0.023)])
+    assert state_of(fleet_page)["vehicles"][0]["values"][1] == ""
     state = state_of(fleet_page)
     assert state["vehicles"][0]["reached"] == len(state["steps"])
     assert (state["vehicles"][0]["bad"], state["orders"]) == (False, "over")

@@ -281,7 +281,7 @@ def test_each_number_key_is_answered(
     assert ends == ["landed", "perched", "perched", "landed"]
     said = [re.sub(r"^\[.*\] ", "", line) for line in capsys.readouterr().err.splitlines()]
     assert [line for line in said if "key" in line and "cuts" not in line] == [
-        "no vehicle is assigned to key 0: press 1 to 4 to land one",
+        "no vehicle is assigned to key 0: press a key from 1 to 4 to land one",
         "west: take-off cancelled (key 4)",
         "north: landing (key 1)",
     ]

@@ -68,6 +68,16 @@ def reporter() -> StatusReporter:
     return StatusReporter(line, ParentSwitch())
 
 
+def test_a_vehicle_that_is_not_ready_says_what_it_is_waiting_for(reporter: StatusReporter) -> None:
+    told = reporter._line.told  # type: ignore[attr-defined]
+    assert not reporter.may_take_off("a good picture")
+    assert not reporter.may_take_off("")
+    assert [(s.stage.value, s.reason) for s in told] == [
+        ("checking", "waiting for a good picture"),
+        ("ready", ""),
+    ]
+
+
 def test_a_status_that_cannot_be_made_is_an_unknown_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """A watcher that raises is detached; its parent would then end the process in the air."""
 

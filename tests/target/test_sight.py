@@ -107,13 +107,13 @@ def test_a_sight_is_the_lens_s_wherever_the_body_stands(
 @pytest.mark.parametrize(
     ("rpy_deg", "words"),
     [
-        ((0.0, 0.0, 0.0), "at most 3.2 m above the camera"),
+        ((0.0, 0.0, 0.0), "the large marker is found at most 3.2 m above the camera"),
         ((0.0, 0.0, 0.0), "within 0.53 m (at 1 m above it)"),
         ((0.0, 12.0, 0.0), "leans 12 deg forward"),
         ((0.0, -12.0, 90.0), "leans 12 deg to the right"),
         ((0.0, 17.0, 45.0), "leans 12 deg forward and 12 deg to the left"),
         ((1.0, -1.0, 0.0), "points straight up"),
-        ((0.0, -90.0, 0.0), "camera that looks up"),
+        ((0.0, -90.0, 0.0), "the large marker is visible only to a camera that looks up"),
     ],
 )
 def test_where_the_target_is_found_overhead(
