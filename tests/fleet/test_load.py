@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from perchctl.errors import InvalidValue, NotFound
 from perchctl.fleet import load_fleet, make_plan
 from perchctl.fleet.fleet import Fleet
 from perchctl.profile import load_profile
+from tests.helpers.flights import ROOT
 
 ATRIUM = """\
 name: atrium
@@ -284,6 +286,15 @@ def test_a_section_may_be_text_and_the_date_is_no_section(tmp_path: Path) -> Non
     fleet = load(tmp_path, two(first=", date: 2026-01-02", defaults=", positioning: target"))
     assert str(fleet.vehicles[0].profile.date) == "2026-01-02"
     assert all(vehicle.profile.positioning.source.is_target for vehicle in fleet.vehicles)
+
+
+def test_the_example_of_four_real_vehicles_can_be_planned(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "swarm.md").read_text(encoding="utf-8")
+    texts = re.findall(r"```yaml\n(name: lab\ndefaults.*?)```", page, re.DOTALL)
+    (tmp_path / "my_vehicle.yaml").write_text("extends: crazyflie\n", encoding="utf-8")
+    plan = make_plan(load(tmp_path, texts[0]))
+    assert [len(dongle.vehicles) for dongle in plan.dongles] == [4]
+    assert {v.profile.link.telemetry_period_s for v in plan.fleet.vehicles} == {0.03}
 
 
 def test_a_fleet_that_is_missing_names_the_choices() -> None:
