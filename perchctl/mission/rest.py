@@ -45,13 +45,17 @@ def find_rest_state(c: Context) -> RestState:
     above, and it either has hardly come down since the phase began high above the ground or has a
     recorded contact and is too high to rest on the floor; otherwise, it is on the floor. Without
     such a position, it is on the floor if a tracked target is far above; otherwise, the falls
-    measured since it came within the magnet's reach decide (`_find_rest_state_from_falls`).
+    measured since it came within the magnet's reach decide (`_find_rest_state_from_falls`). After a
+    restart of the vehicle, its estimate starts again at the origin, so neither its earlier position
+    nor a target that was last seen before the restart proves anything.
     """
     b, state = c.belief, c.state
     if _is_held_by_other_object(c):
         return RestState.HELD
-    if b.is_target_position_source or not b.is_position_valid:
-        if b.target.is_tracked and b.target.is_far_above:
+    restarted_at_s = b.imu.vehicle_restarted_at_s
+    if b.is_target_position_source or not b.is_position_valid or restarted_at_s > state.entry.t_s:
+        is_seen = b.target.is_tracked and b.dead_reckoning.last_sighting_at_s >= restarted_at_s
+        if is_seen and b.target.is_far_above:
             return RestState.STANDS
         return _find_rest_state_from_falls(c)
     high = state.entry.position_m[2] - b.ground_z_m > MIN_HEIGHT_TO_INFER_HANGING_M

@@ -52,6 +52,7 @@ from tests.helpers.mission import (
     HANG_Z_M,
     HOVER_THRUST,
     MOCAP,
+    PROFILE,
     PROFILES,
     READY,
     Felt,
@@ -601,6 +602,7 @@ def ended(
     imu: ImuMotion = UNMOVED,
     dead_reckoning: DeadReckoning = UNRECKONED,
     floor_detected_at_s: float | None = None,
+    profile: Profile = BY_TARGET,
     **observed: Any,
 ) -> RestState:
     seen = {"target": None, "external_position_age_s": 3.0, "imu": imu, **observed}
@@ -611,7 +613,7 @@ def ended(
         floor_detected_at_s=floor_detected_at_s,
         dead_reckoning=replace(dead_reckoning, imu=imu),
     )  # fmt: skip
-    return rest.find_rest_state(context_at(state, obs, BY_TARGET))
+    return rest.find_rest_state(context_at(state, obs, profile))
 
 
 @pytest.mark.parametrize(
@@ -634,6 +636,34 @@ def test_what_was_in_reach_and_has_not_fallen_since_hangs(
             ImuMotion(
                 t_s=NOW_S, last_fall_at_s=fell_s, last_gap_that_may_hide_fall_ended_at_s=gap_s
             ),
+        )
+        is found
+    )
+
+
+@pytest.mark.parametrize("by_target", [True, False])
+@pytest.mark.parametrize(("seen_s", "found"), [(-3.0, RestState.UNKNOWN), (-1.0, RestState.STANDS)])
+def test_after_a_restart_only_a_new_sighting_shows_the_floor(
+    by_target: bool, seen_s: float, found: RestState
+) -> None:
+    """Its estimate is at the origin again, so the target on which it hangs seemed far above, and it
+    was reported to be on the floor (seed 2612021214)."""
+    restarted = ImuMotion(
+        t_s=NOW_S,
+        vehicle_restarted_at_s=NOW_S - 2.0,
+        last_gap_that_may_hide_fall_ended_at_s=NOW_S - 2.0,
+    )
+    assert (
+        ended(
+            NOW_S - 6.0,
+            restarted,
+            DeadReckoning(
+                last_gap_in_which_magnet_may_attach_ended_at_s=NOW_S - 2.0,
+                last_sighting_at_s=NOW_S + seen_s,
+            ),
+            profile=BY_TARGET if by_target else PROFILE,
+            target=target_at(NOW_S, (0.0, 0.0, CEILING_M), (0.0, 0.0, 0.0)),
+            external_position_age_s=0.01,
         )
         is found
     )
