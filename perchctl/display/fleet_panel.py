@@ -65,7 +65,8 @@ class FleetRow:
 class FleetPanel(TerminalDisplay):
     """Prints events and, on a terminal, a line for each vehicle below them.
 
-    `frame`: sentences for the panel's lower and upper border, truncated to the panel's width.
+    `frame`: sentences for the panel's lower and upper border until all flights are over, truncated
+    to the panel's width.
     """
 
     def __init__(self, stream: TextIO, frame: tuple[str, str] = ("", "")) -> None:
@@ -88,7 +89,7 @@ class FleetPanel(TerminalDisplay):
         if not rows or rows == self._drawn:
             return None
         self._drawn = rows
-        return fleet_table(rows, *self._frame)
+        return fleet_table(rows, *(() if all(row.has_ended for row in rows) else self._frame))
 
 
 def fleet_table(rows: Sequence[FleetRow], below: str = "", above: str = "") -> Panel:

@@ -79,7 +79,7 @@ class FlightPage:
 
     def _remember(self, tick: Tick) -> None:
         if not self._past or tick.t_s - self._past[-1][0] >= PAST_PERIOD_S:
-            self._past.append((tick.t_s, *_off_and_below_m(tick)))
+            self._past.append((tick.t_s, *(tick.off_and_below_m or (None, None))))
 
     def event(self, event: Event) -> None:
         if event.rest_state is not None:
@@ -113,21 +113,16 @@ class FlightPage:
         self.page.end({"outcome": outcome.upper(), "good": good, "reason": reason, "rows": rows})
 
 
-def _off_and_below_m(tick: Tick) -> tuple[float | None, float | None]:
-    target = tick.target
-    return (None, None) if target is None else (math.hypot(*target.e_m[:2]), float(target.e_m[2]))
-
-
 def flight_state(
     tick: Tick, drawing_sizes: dict[str, float], past: Sequence[Past] = ()
 ) -> dict[str, Any]:
     """The page's state for a tick: phase, battery, the rows of the terminal's panel, and a flag
     that says whether the flight is over. For the page's drawings, it also contains the height, the
-    target's lateral offset and its distance above the vehicle in m (None: no target), and
+    target's lateral offset and its distance above the vehicle in m (None: unknown), and
     `drawing_sizes` (`large_m`, `gear_m`). `past`: earlier values for a page that is opened late,
     sent as age in s, offset and distance."""
     state, volts = tick.state, tick.telemetry.battery_v
-    off_m, below_m = _off_and_below_m(tick)
+    off_m, below_m = tick.off_and_below_m or (None, None)
     ground_m, hover = state.belief.ground_z_m, state.belief.profile.planner.hover
     return {
         "phase": state.phase.value,

@@ -21,17 +21,9 @@ from perchctl.vehicle import NO_BATTERY_READING_V
 
 
 def status_rows(tick: Tick) -> list[tuple[str, str]]:
-    """Return the name and the text of each line in the status panel, together at most 80 columns
-    wide, in m, cm and degrees."""
+    """Return the name and the text of each row in the status panel, in m, cm and degrees. A text
+    with several figures fits into one line of the panel; a sentence may be longer."""
     state, target = tick.state, tick.target
-    if target is None:
-        error = "no target seen yet"
-    else:
-        x, y, z = (f"{100.0 * v:+.1f}" for v in target.e_m)
-        yaw_deg = math.degrees(target.e_yaw_rad)
-        yaw = "-" if math.isnan(yaw_deg) else f"{yaw_deg:+.1f}"
-        error = f"x {x}  y {y}  z {z} cm   yaw {yaw} deg"
-        error += "" if target.tracked else "   (not seen)"
     stage = "none" if target is None else target.stage.value
     height_m = tick.telemetry.position_m[2] - state.belief.ground_z_m
     ages = (
@@ -40,7 +32,7 @@ def status_rows(tick: Tick) -> list[tuple[str, str]]:
     )
     return [
         ("phase", f"{state.phase.value}  {tick.t_s - state.entry.t_s:.1f} s"),
-        ("error", error),
+        *_error_row(tick),
         ("markers", f"{stage}   failed attempts {state.failed_attempts}"),
         ("height", f"{height_m:.2f} m   battery {_battery_text(tick)}"),
         ("ages", ages),
@@ -52,6 +44,21 @@ def status_rows(tick: Tick) -> list[tuple[str, str]]:
         *([("hover", _hover_text(state))] if state.phase is Phase.HOVER else []),
         ("held" if state.pause_reason else "reason", state.pause_reason or state.reason),
     ]
+
+
+def _error_row(tick: Tick) -> list[tuple[str, str]]:
+    """The error to the target or, from a proven contact on, the offset at the contact. No row for a
+    target that is not seen after the contact or after the flight, because that estimate drifts."""
+    target = tick.target_to_show
+    if tick.contact is not None:
+        return [("contact", tick.contact.text)]
+    if target is None:
+        return [("error", "no target seen yet")] if tick.target is None else []
+    x, y, z = (f"{100.0 * v:+.1f}" for v in target.e_m)
+    yaw_deg = math.degrees(target.e_yaw_rad)
+    yaw = "-" if math.isnan(yaw_deg) else f"{yaw_deg:+.1f}"
+    seen = "" if target.tracked else "   (not seen)"
+    return [("error", f"x {x}  y {y}  z {z} cm   yaw {yaw} deg{seen}")]
 
 
 def _hover_text(state: PlannerState) -> str:
@@ -113,7 +120,8 @@ class FlightPanel(TerminalDisplay):
     name = "the panel"
     problem: str | None = None
     help: tuple[str, str] = ("", "")
-    """Sentences in the panel's lower and upper border, at most 60 columns each."""
+    """Sentences in the panel's lower and upper border until the flight is over, at most 60 columns
+    each."""
 
     def __init__(self, stream: TextIO) -> None:
         self._tick: Tick | None = None
@@ -142,16 +150,16 @@ class FlightPanel(TerminalDisplay):
         if tick is None or tick is self._drawn:
             return None
         self._drawn = tick
-        return status_panel(tick, *self.help)
+        return status_panel(tick, *(() if tick.state.phase.is_final else self.help))
 
 
 def status_panel(tick: Tick, below: str = "", above: str = "") -> Panel:
-    """The status panel for a tick: at most `PANEL_COLUMNS` columns and eight lines, with one more
-    line for external positions and one more during a hover. `below` and `above` are sentences for
-    its lower and upper border."""
+    """The status panel for a tick: at most `PANEL_COLUMNS` columns wide, with a line for each row,
+    and more lines for a long reason. `below` and `above` are sentences for its lower and upper
+    border."""
     table = Table.grid(padding=(0, 2))
     table.add_column(no_wrap=True, min_width=7)
-    table.add_column(no_wrap=True, overflow="ellipsis")
+    table.add_column()
     for name, text in status_rows(tick):
         style = phase_style(tick.state.phase.value) if name == "phase" else ""
         style = "bold yellow" if name == "held" else style

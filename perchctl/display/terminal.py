@@ -122,8 +122,8 @@ def frame_table(table: Table, below: str = "", above: str = "") -> Panel:
     border."""
     return Panel(
         table,
-        title=Text(f"perchctl: {above}" if above else "perchctl"),
-        subtitle=Text(below) if below else None,
+        title=Text(f"perchctl: {above}" if above else "perchctl", overflow="ellipsis"),
+        subtitle=Text(below, overflow="ellipsis") if below else None,
         title_align="left",
         subtitle_align="left",
         width=PANEL_COLUMNS,

@@ -345,14 +345,14 @@ class StatusReporter(Watcher):
 
 def flight_status(tick: Tick) -> Status:
     """Return the status of a vehicle that is flying, is hanging or has landed."""
-    state, telemetry, target = tick.state, tick.telemetry, tick.target
+    state, telemetry, known_m = tick.state, tick.telemetry, tick.off_and_below_m
     x_m, y_m, z_m = telemetry.position_m
     return Status(
         stage=Stage.ENDING if state.phase.is_final else Stage.FLYING,
         phase=state.phase,
         reason=state.pause_reason or state.reason,
         height_m=z_m - state.belief.ground_z_m,
-        error_m=None if target is None else math.hypot(*target.e_m[:2]),
+        error_m=None if known_m is None else known_m[0],
         battery_v=telemetry.battery_v if telemetry.battery_v >= NO_BATTERY_READING_V else None,
         telemetry_age_s=tick.telemetry_age_s,
         place_m=(x_m, y_m) if state.belief.is_position_trusted else None,

@@ -5,11 +5,13 @@ From the `TickRecord` records, the decisions of a flight can be replayed (`perch
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Literal, Protocol
 
 from perchctl.geometry import Array
+from perchctl.mission.belief.belief import GearToTargetDistance
 from perchctl.mission.belief.quality import position_loss_text
 from perchctl.mission.observation import Observation
 from perchctl.mission.phase import Outcome, Phase, Severity, VehicleDiagnosis
@@ -242,6 +244,33 @@ class Tick:
     def target(self) -> TargetEstimate | None:
         """The target estimate that the planner used; None before the first sighting."""
         return self.observation.target
+
+    @property
+    def contact(self) -> GearToTargetDistance | None:
+        """Distance between gear and target at the contact that was proven; None except in COMPLETE
+        and PERCHED."""
+        is_at_target = self.state.phase in (Phase.COMPLETE, Phase.PERCHED)
+        return self.state.belief.gear_to_target_at_last_contact if is_at_target else None
+
+    @property
+    def target_to_show(self) -> TargetEstimate | None:
+        """The target estimate, for displays; None if it may no longer be true: the estimate of a
+        target that the camera cannot see drifts, so a display shows it only until the contact is
+        proven or the flight is over."""
+        target, phase = self.target, self.state.phase
+        is_shown_unseen = phase.is_before_contact or phase is Phase.LANDING
+        is_shown = target is not None and (target.tracked or is_shown_unseen)
+        return target if is_shown and self.contact is None else None
+
+    @property
+    def off_and_below_m(self) -> tuple[float, float] | None:
+        """For displays: lateral distance between gear and target, and height of the target above
+        the gear, m. From a proven contact on, these are the distances at the contact. None if
+        unknown."""
+        contact, target = self.contact, self.target_to_show
+        if contact is not None and math.isfinite(contact.sigma_m):
+            return contact.distance_xy_m, 0.0
+        return None if target is None else (math.hypot(*target.e_m[:2]), float(target.e_m[2]))
 
     @property
     def tick_start_delay_s(self) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -44,6 +45,18 @@ def test_lines_stand_above_the_newest_rows_and_the_last_ones_stay(terminal: Term
     assert "LANDED" in last
     assert "ALIGN" not in last
     assert "below" in last
+
+
+def test_keys_are_offered_until_all_flights_are_over(terminal: Terminal) -> None:
+    panel = FleetPanel(terminal, ("below", "above"))
+    panel.show([replace(row("PERCHED"), has_ended=True), row("ASCEND")])
+    until(lambda: "ASCEND" in terminal.getvalue())
+    assert "below" in terminal.getvalue()
+    panel.show([replace(row("PERCHED"), has_ended=True), replace(row("LANDED"), has_ended=True)])
+    panel.close()
+    last = terminal.getvalue().rpartition("ASCEND")[2]
+    assert "below" not in last.rpartition("perchctl")[2]
+    assert "above" not in last.rpartition("perchctl")[2]
 
 
 def test_there_are_only_lines_where_there_is_no_terminal() -> None:

@@ -22,6 +22,7 @@ from perchctl.flight import FlyOptions, OperatorSwitch
 from perchctl.mission import (
     Event,
     FlightReport,
+    GearToTargetDistance,
     OperatorRequest,
     Outcome,
     Phase,
@@ -81,6 +82,20 @@ def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> Non
     state = state_of(page)
     assert (state["below_m"], state["note"]) == (None, "held: camera silent")
     assert flight.problem is None
+
+
+def test_from_the_contact_on_the_page_shows_the_offset_at_the_contact(page: LivePage) -> None:
+    flight = FlightPage(page, 0.15, 0.03)
+    contact = GearToTargetDistance(0.0024, 0.001)
+    flight.tick(tick(START_S, "COMPLETE", tracked=False, contact=contact))
+    state = state_of(page)
+    assert (state["off_m"], state["below_m"]) == (0.0024, 0.0)
+    assert state["rows"][0] == ["contact", "2.4 +- 1.0 mm off centre"]
+    flight.tick(tick(START_S + 0.5, "LANDED", tracked=False, contact=contact))
+    state = state_of(page)
+    assert (state["off_m"], state["below_m"]) == (None, None)
+    assert "error" not in dict(state["rows"])
+    assert state["past"][0][1:] == [0.0024, 0.0]
 
 
 def test_a_page_opened_in_mid_flight_gets_the_trace_so_far(page: LivePage) -> None:

@@ -15,7 +15,7 @@ from rich.text import Text
 from perchctl.display import FlightPanel
 from perchctl.display.panel import status_panel, status_rows
 from perchctl.flight import KEY_HELP, STOP_HELP
-from perchctl.mission import Phase
+from perchctl.mission import GearToTargetDistance, Phase
 from tests.helpers.live_page import hover_tick, tick
 from tests.helpers.mission import entered, held, note
 from tests.helpers.waiting import until
@@ -117,6 +117,13 @@ def test_no_colour_where_none_is_wanted(
         assert terminal.getvalue() == "[   0.00 s] ABORTED: pose is steady\n"
 
 
+def text_inside(lines: list[str]) -> str:
+    """The text between the frame's sides, in one line."""
+    return " ".join(
+        word for line in lines for word in line.strip("\N{BOX DRAWINGS LIGHT VERTICAL}").split()
+    )
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -135,11 +142,67 @@ def test_the_panel_fits_into_80_columns(changes: dict[str, Any]) -> None:
     lines = capture.get().splitlines()
     assert STOP_HELP in lines[-1]
     assert KEY_HELP in lines[0]
-    assert len(lines) == 8
+    inside = " ".join(
+        " ".join(line.strip("\N{BOX DRAWINGS LIGHT VERTICAL} ") for line in lines).split()
+    )
+    if "hold" in changes:  # a sentence of any length is whole
+        assert " ".join(changes["hold"].split()) in inside
+    else:
+        assert len(lines) == 8
+    assert "\N{HORIZONTAL ELLIPSIS}" not in inside
     assert max(Text(line.rstrip()).cell_len for line in lines) + len("^C") <= 80
     assert "   failed attempts 1" in dict(status_rows(shown))["markers"]
     for name, _ in status_rows(shown):
         assert sum(f" {name} " in line for line in lines) == 1, name
+
+
+LAST_ROW = "contact proven by position, acceleration and thrust; 4.2 +- 1.0 mm off centre"
+
+
+@pytest.mark.parametrize("columns", [80, 50])
+def test_the_panel_cuts_no_unit_off(columns: int) -> None:
+    console = Console(width=columns, file=io.StringIO(), highlight=False, markup=False)
+    with console.capture() as capture:
+        console.print(status_panel(tick(phase="COMPLETE", reason=LAST_ROW), STOP_HELP, KEY_HELP))
+    shown = capture.get()
+    assert LAST_ROW in text_inside(shown.splitlines())
+    assert (KEY_HELP in shown) is (columns == 80)
+    assert ("\N{HORIZONTAL ELLIPSIS}" in shown.splitlines()[0]) is (columns == 50)
+
+
+@pytest.mark.parametrize(
+    ("phase", "tracked", "contact", "shown"),
+    [
+        ("ALIGN", False, None, "(not seen)"),
+        ("LANDING", False, None, "(not seen)"),
+        ("COMPLETE", False, GearToTargetDistance(0.0024, 0.001), "2.4 +- 1.0 mm off centre"),
+        ("COMPLETE", True, GearToTargetDistance(0.0024, math.inf), "at an unknown distance"),
+        ("PERCHED", False, GearToTargetDistance(0.0024, 0.001), "2.4 +- 1.0 mm off centre"),
+        ("LANDED", False, GearToTargetDistance(0.0024, 0.001), None),
+        ("LANDED", True, None, "x -12.3"),
+        ("ABORTED", False, None, None),
+    ],
+)
+def test_an_error_that_drifts_unseen_is_not_shown(
+    phase: str, tracked: bool, contact: GearToTargetDistance | None, shown: str | None
+) -> None:
+    rows = dict(status_rows(tick(phase=phase, tracked=tracked, contact=contact)))
+    text = rows.get("error", rows.get("contact"))
+    assert shown in text if shown and text else shown == text
+    assert "error" not in rows or "contact" not in rows
+
+
+def test_keys_that_do_nothing_any_more_are_not_offered(terminal: Terminal) -> None:
+    reporter = FlightPanel(terminal)
+    reporter.help = STOP_HELP, KEY_HELP
+    reporter.tick(tick(100.0, "COMPLETE"))
+    until(lambda: STOP_HELP in terminal.getvalue())
+    reporter.tick(tick(100.02, "PERCHED"))
+    reporter.close()
+    last = terminal.getvalue().rpartition("PERCHED")[0].rpartition("COMPLETE")[2]
+    after = terminal.getvalue().rpartition("PERCHED")[2]
+    assert KEY_HELP not in last
+    assert STOP_HELP not in after
 
 
 def test_a_display_that_fails_falls_silent_once() -> None:

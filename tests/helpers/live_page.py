@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from perchctl.display.serve import TOKEN_HEADER
-from perchctl.mission import Observation, Outcome, Phase, Tick
+from perchctl.mission import GearToTargetDistance, Observation, Outcome, Phase, Tick
 from perchctl.mission.state import BatteryOutlook, HoverErrors
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers import log as synthetic
@@ -26,6 +26,7 @@ def tick(
     e_yaw_rad: float = math.radians(-166.2), tracked: bool = True, battery_v: float = 3.714,
     battery: BatteryOutlook | None = None, output: Any = None,
     camera_age_s: float = 0.05, telemetry_age_s: float = 0.012,
+    contact: GearToTargetDistance | None = None,
 ) -> Tick:  # fmt: skip
     """A moment of a flight."""
     seen = None
@@ -36,6 +37,7 @@ def tick(
     state = state_with(
         phase=Phase(phase), entered_s=entered_s, reason=reason, hold_reason=hold, failed_attempts=1,
         takeoff_position_m=(0.0, 0.0, 0.1), battery=battery or BatteryOutlook(),
+        gear_to_target_at_last_contact=contact,
     )  # fmt: skip
     sample = replace(synthetic.telemetry(t_s, 0.92), battery_v=battery_v, behind_s=telemetry_age_s)
     command = PositionSetpoint(1.0, 2.0, 0.5, 0.0)
