@@ -56,6 +56,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
         "perchctl.children",
         "perchctl.extensions",
         "perchctl.opencv_threads",
+        "perchctl.wrapping",
     ),
     ("perchctl.plot", "perchctl.report_page"),
     ("perchctl.profile",),

@@ -4,6 +4,7 @@ a full disk, Ctrl-C at the wrong time."""
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import re
@@ -21,7 +22,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl import __version__
 from perchctl.commands.command_line import COMMANDS, report_failures
-from perchctl.commands.output import ask, ask_to_confirm
+from perchctl.commands.output import ask, ask_to_confirm, say
 from perchctl.errors import EXIT_CODES, InvalidValue, ProfileNote, UsageError
 from perchctl.startup import is_command_line
 from tests.helpers.commands import elsewhere, run, run_apart  # noqa: F401
@@ -259,6 +260,34 @@ def test_options_that_would_not_be_heeded_are_refused(line: str, words: list[str
     assert said.code == 2
     for word in words:
         assert word in said.complaint
+
+
+# --- On a terminal -------------------------------------------------------------------------
+
+
+def test_a_message_breaks_between_words_but_only_on_a_terminal(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path = "/home/somebody/" + "a_long_folder/" * 7 + "flight.jsonl"
+    copied = "  SUBSYSTEM==usb, " + "ATTRS==1915, " * 8 + "MODE==0664"
+    sentence = f"the newest log of all the flights that were flown today: {path}: it ends\n{copied}"
+
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setenv("COLUMNS", "80")
+    terminal, pipe = Terminal(), io.StringIO()
+    for stream in (terminal, pipe):
+        monkeypatch.setattr("sys.stderr", stream)
+        say(sentence)
+    assert pipe.getvalue() == f"perchctl: {sentence}\n"
+    assert terminal.getvalue().splitlines() == [
+        "perchctl: the newest log of all the flights that were flown today:",
+        f"          {path}:",
+        "          it ends",
+        copied,
+    ]
 
 
 # --- Questions -----------------------------------------------------------------------------

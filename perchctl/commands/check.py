@@ -169,7 +169,12 @@ def _lines(row: checks.Row) -> list[str]:
 
 def _wrapped(text: str, first: str, others: str) -> list[str]:
     return textwrap.wrap(
-        text, CHECK_COLUMNS, initial_indent=first, subsequent_indent=others, break_on_hyphens=False
+        text,
+        CHECK_COLUMNS,
+        initial_indent=first,
+        subsequent_indent=others,
+        break_long_words=False,
+        break_on_hyphens=False,
     )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import shlex
 import sys
-import textwrap
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -50,6 +49,7 @@ from perchctl.commands.simulate import (
 )
 from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
 from perchctl.files import check_output, write_files
+from perchctl.wrapping import wrap_line
 
 PLAN_COLUMNS = 80
 PICTURE = "a drawing of the room"
@@ -268,15 +268,7 @@ def plan_text(plan: fleets.FleetPlan) -> str:
         [
             fleets.draw_text(plan.fleet, schedule.groups),
             "",
-            *(
-                textwrap.fill(
-                    f"{name:<14}{text}",
-                    PLAN_COLUMNS,
-                    subsequent_indent=" " * 14,
-                    break_on_hyphens=False,
-                )
-                for name, text in rows
-            ),
+            *(wrap_line(f"{name:<14}{text}", PLAN_COLUMNS, 14) for name, text in rows),
         ]
     )
 

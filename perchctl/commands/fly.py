@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import sys
-import textwrap
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import datetime
@@ -52,6 +51,7 @@ from perchctl.errors import (
     PerchError,
     UsageError,
 )
+from perchctl.wrapping import wrap_line
 
 SeedOption = Annotated[
     int | None, typer.Option("--seed", help="Seed of the simulated scenario. Default: 11.")
@@ -418,16 +418,7 @@ def plan_text(options: flights.FlyOptions) -> str:
         for row in resolved["check"]
         if row["verdict"] in (checks.Verdict.WARN, checks.Verdict.FAIL)
     ]
-    return "\n".join(
-        textwrap.fill(
-            f"{name:{_COLUMN}}{text}",
-            _WIDTH,
-            subsequent_indent=" " * _COLUMN,
-            break_long_words=False,
-            break_on_hyphens=False,
-        )
-        for name, text in rows
-    )
+    return "\n".join(wrap_line(f"{name:{_COLUMN}}{text}", _WIDTH, _COLUMN) for name, text in rows)
 
 
 def _positioning(options: flights.FlyOptions) -> str:

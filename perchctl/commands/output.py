@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from perchctl.errors import PerchError
+from perchctl.wrapping import wrap_for
 
 NO = ("n", "no", "q", "quit")
 """Answers that cancel a prompt that only waits for Enter."""
@@ -31,11 +32,12 @@ def say_on_terminal(sentence: str) -> None:
 
 
 def print_lines(text: str, stdout: bool = False) -> bool:
-    """Print lines on stderr or stdout; a closed terminal or broken pipe is not an error. Return
-    False if a result on stdout is lost, for example because a disk is full."""
+    """Print lines on stderr or stdout, wrapped between words on a terminal; a closed terminal or
+    broken pipe is not an error. Return False if a result on stdout is lost, for example because a
+    disk is full."""
     stream = sys.stdout if stdout else sys.stderr
     try:
-        print(text, file=stream, flush=True)
+        print(wrap_for(stream, text), file=stream, flush=True)
     except (OSError, ValueError) as error:
         discard_output(stream)
         if stdout and isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
@@ -61,14 +63,15 @@ def stdin_number() -> int:
 def ask(question: str) -> str:
     """Ask a question on stderr, with line editing on a terminal, and return the typed line. Raises
     EOFError at the end of the input."""
+    question = wrap_for(sys.stderr, question.rstrip())
     if sys.stdin.isatty() and sys.stdout.isatty():
         with contextlib.suppress(ImportError):
             import readline  # noqa: F401  importing it enables line editing in input()
-        *above, last = question.rstrip().split("\n")
+        *above, last = question.split("\n")
         if above:
             print("\n".join(above), file=sys.stderr, flush=True)
         return input(f"{last} ")  # readline redraws its own prompt during editing
-    print(f"{question.rstrip()} ", end="", file=sys.stderr, flush=True)
+    print(f"{question} ", end="", file=sys.stderr, flush=True)
     return input()
 
 

@@ -8,7 +8,6 @@ import json
 import math
 import re
 import shlex
-import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -33,6 +32,7 @@ from perchctl.commands.output import NO, ask, print_lines, print_result, say, sa
 from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.extensions import is_extension
 from perchctl.files import check_output, write_files
+from perchctl.wrapping import wrap_line
 
 if TYPE_CHECKING:
     from perchctl.geometry import Array
@@ -132,6 +132,7 @@ EDGES_AND_CEILING = ("front", "left", "ceiling")
 """Questions that are not keys of the profile."""
 BACK = "back"
 _TERMINAL_COLUMNS = 80
+_NAME_COLUMNS = 25
 CEILING_M = (1.0, 10.0)
 OVER_THE_CEILING_M = 0.4
 """Distance of the height limit above the ceiling, so that a drifting estimate does not end a
@@ -265,7 +266,7 @@ def ask_questions(given: Answers) -> Answers:
         else:
             name = names[number - 1]
             default = default_answer(name, answers)
-            words = _wrapped(f"{number} of {len(names)}: {WORDS[name]}")
+            words = wrap_line(f"{number} of {len(names)}: {WORDS[name]}", _TERMINAL_COLUMNS, 0)
             question = f"{words}\n  [{_shown(name, default)}]"
         try:
             typed = _typed(question)
@@ -284,22 +285,7 @@ def ask_questions(given: Answers) -> Answers:
         except (PerchError, UnicodeDecodeError) as error:
             if isinstance(error, UsageError):
                 raise
-            print_lines(_wrapped(str(error), "  "))
-
-
-def _wrapped(text: str, margin: str = "") -> str:
-    """Return the text wrapped between words for a terminal of 80 columns."""
-    return "\n".join(
-        textwrap.fill(
-            line,
-            _TERMINAL_COLUMNS,
-            initial_indent=margin,
-            subsequent_indent=margin,
-            break_long_words=False,
-            break_on_hyphens=False,
-        )
-        for line in text.splitlines()
-    )
+            print_lines(wrap_line(f"  {error}", _TERMINAL_COLUMNS, 2))
 
 
 def _typed(question: str) -> str:
@@ -355,7 +341,10 @@ def answers_text(answers: Answers) -> str:
     turn = profile.camera.mount.rpy_deg[2]
     rows = [(name, _shown(name, answers[name])) for name in QUESTIONS if name in answers]
     rows.append(("picture", f"{mirrored}, turned by {turn:g} deg about the vertical axis"))
-    return "\n".join(f"  {name:<24} {text}" for name, text in rows)
+    return "\n".join(
+        wrap_line(f"  {name:<{_NAME_COLUMNS}}{text}", _TERMINAL_COLUMNS, 2 + _NAME_COLUMNS)
+        for name, text in rows
+    )
 
 
 def profile_and_keys(

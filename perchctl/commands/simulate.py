@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-import textwrap
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -44,6 +43,7 @@ from perchctl.errors import (
     UsageError,
     no_cluster,
 )
+from perchctl.wrapping import wrap_line
 
 CAMPAIGN_SAME_PRESS_S = 0.5
 """Shortest time after the first Ctrl-C at which a second one counts, s. Presses that are closer
@@ -410,8 +410,7 @@ def print_faults(faults: Mapping[str, str], as_json: bool) -> int:
     """Print the name and the description of each fault; returns the exit code."""
     indent, columns = 2 + max(map(len, faults)), shutil.get_terminal_size().columns
     table = "\n".join(
-        textwrap.fill(f"{name:<{indent}}{text}", columns, subsequent_indent=" " * indent)
-        for name, text in faults.items()
+        wrap_line(f"{name:<{indent}}{text}", columns, indent) for name, text in faults.items()
     )
     print_result({"faults": dict(faults)} if as_json else table)
     return 0

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import textwrap
 import threading
 from collections import deque
 from typing import TextIO
@@ -19,6 +18,8 @@ from rich.live import Live
 from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
+
+from perchctl.wrapping import wrap_line
 
 PANEL_PERIOD_S = 0.1
 PANEL_CLOSE_TIMEOUT_S = 1.0
@@ -80,7 +81,7 @@ class TerminalDisplay:
         while self._lines:
             line = self._lines.popleft()
             if self._live is not None:
-                folded = _fold(line, self._live.console.width)
+                folded = wrap_line(line, self._live.console.width)
                 self._live.console.print(Text(folded), soft_wrap=True)
             else:
                 self._stream.write(line + "\n")
@@ -88,20 +89,6 @@ class TerminalDisplay:
         panel = None if self._live is None else self._new_panel()
         if self._live is not None and panel is not None:
             self._live.update(panel, refresh=True)
-
-
-def _fold(line: str, columns: int) -> str:
-    """Break a line between words, and indent the continuation lines to align with the text after
-    its time. A word that is longer than a line, such as a path, stays whole, so that it can be
-    copied."""
-    indent = line.find("] ") + 2 if line.startswith("[") else 0
-    return textwrap.fill(
-        line,
-        columns,
-        subsequent_indent=" " * indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
 
 
 def new_live(stream: TextIO) -> Live:
