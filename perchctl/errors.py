@@ -100,7 +100,7 @@ class ConnectionFailed(PerchError):
 
 class NotFound(PerchError):
     exit_code = 20
-    meaning = "file, profile, firmware variable or camera not found, or camera cannot be opened"
+    meaning = "file, profile, variable or camera not found, or camera cannot be opened"
 
 
 class InvalidValue(PerchError):
@@ -110,7 +110,7 @@ class InvalidValue(PerchError):
 
 class TimedOut(PerchError):
     exit_code = 40
-    meaning = "timeout before the flight, for example because no image from the camera arrived"
+    meaning = "timeout before the flight, such as no image from the camera"
 
 
 class TargetNotFound(PerchError):
