@@ -178,9 +178,48 @@ def test_fly_help_lists_every_exit_code_in_a_line() -> None:
 
 
 def test_wrong_usage_is_2() -> None:
-    for words in ("fly --bogus", "perch", "simulate -n 0", "simulate --seed -1"):
+    for words in (
+        "fly --bogus",
+        "perch",
+        "fly --seed",
+        "calibrate camera:0 --size 640",
+        "calibrate",
+    ):
         assert run(*words.split()).code == 2
     assert run("--version").stdout.strip() == f"perchctl {__version__}"
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("simulate -n 0", "-n/--flights: found '0'; allowed are whole numbers of 1 or more"),
+        ("simulate --seed -1", "--seed: found '-1'; allowed are whole numbers of 0 or more"),
+        ("fly --seed -3", "--seed: found '-3'; allowed are whole numbers of 0 or more"),
+        ("fly --seed one", "--seed: found 'one'; allowed are whole numbers of 0 or more"),
+        ("log film --rate 100", "--rate: found '100'; allowed are numbers from 1 to 60"),
+        (
+            "log film --width 1.5",
+            "--width: found '1.5'; allowed are whole numbers from 320 to 1920",
+        ),
+        ("calibrate camera:0 --size 640 x", "--size: found 'x'; allowed are whole numbers"),
+        (
+            "fit-weights x.csv --method magic",
+            "--method: found 'magic'; allowed are closed_form, lms",
+        ),
+        *(
+            (f"{command} {setting}", f"{setting} must be KEY=VALUE")
+            for command in ("profile new --defaults --set", "simulate sweep")
+            for setting in ("link.uri", "=3")
+        ),
+    ],
+)
+def test_an_option_with_a_wrong_value_is_30_and_says_what_is_allowed(
+    words: str, sentence: str
+) -> None:
+    done = run(*words.split(), *(["--json"] if "fly" in words else []))
+    assert done.code == 30
+    assert sentence in done.complaint.replace(",VALUE", "")
+    assert not list(Path().iterdir())
 
 
 # --- Failures ------------------------------------------------------------------------------

@@ -134,7 +134,7 @@ def test_the_uri_of_the_environment_is_used(monkeypatch: pytest.MonkeyPatch) -> 
         ("--source webcam:0", 30, ["'webcam:0'", "camera:N"]),
         ("--source=", 30, ["camera:N"]),
         ("--dry-run --source webcam:0", 30, ["'webcam:0'", "camera:N"]),
-        ("--seed -1", 30, ["-1", "negative"]),
+        ("--seed -1", 30, ["'-1'", "whole numbers of 0 or more"]),
         (f"--uri {NOWHERE} --source camera:97 --yes", 20, ["camera:97"]),
         ("--source video:none.mp4", 20, ["none.mp4"]),
         (f"--uri {NOWHERE} --source video:none.mp4", 2, ["recording", NOWHERE]),

@@ -37,10 +37,10 @@ def test_without_a_profile_of_its_own_it_has_its_defaults() -> None:
 @pytest.mark.parametrize("words", [
     "--below 0.1", "--below 2.5", "--below nan", "--time 0", "--time 301", "--time nan",
 ])  # fmt: skip
-def test_a_distance_or_time_out_of_bounds_is_wrong_usage(words: str) -> None:
+def test_a_distance_or_time_out_of_bounds_is_an_invalid_value(words: str) -> None:
     done = run("hover", "--dry-run", *words.split())
-    assert (done.code, done.stdout) == (2, "")
-    assert words.split()[0] in done.stderr
+    assert (done.code, done.stdout) == (30, "")
+    assert f"{words.split()[0]}: found" in done.complaint
 
 
 def test_commands_that_perch_refuse_a_profile_that_hovers() -> None:

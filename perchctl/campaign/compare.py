@@ -28,7 +28,7 @@ from perchctl.campaign.results import (
     rate_record,
     rate_text,
 )
-from perchctl.errors import InvalidValue, UsageError
+from perchctl.errors import InvalidValue
 from perchctl.plain_yaml import clip_text, split_values
 from perchctl.profile import Profile, apply_settings, profile_value, yaml_scalar
 
@@ -239,14 +239,14 @@ class Sweep:
 
 def make_sweep(profile: Profile, sweep: str) -> Sweep:
     """The sweep of `profile` given by the text ``key=value,value``, with values as in a profile's
-    file. Errors: UsageError, InvalidValue."""
+    file. Errors: InvalidValue."""
     key, equals, text = (part.strip() for part in sweep.partition("="))
     try:
         texts = list(split_values(text))
     except ValueError as error:
         raise InvalidValue(f"sweep {clip_text(sweep)}: {error}") from None
     if not equals or not key or not texts:
-        raise UsageError(
+        raise InvalidValue(
             f"{clip_text(sweep)} must be KEY=VALUE,VALUE with a key of the profile, as in "
             f"planner.align.xy_m=0.02,0.04"
         )

@@ -267,6 +267,8 @@ def report_failures(as_json: bool = False) -> Iterator[None]:
         discard_output(sys.stdout)
         raise typer.Exit(PerchError.exit_code) from None
     except Exception as error:
+        if type(error) is typer.BadParameter:  # its subclass is a missing parameter
+            _leave(_value_problem(error), InvalidValue.exit_code, as_json)
         if hasattr(error, "format_message"):  # a usage error, which typer prints
             if as_json:
                 _print_failure(error.format_message(), UsageError.exit_code)
@@ -290,6 +292,27 @@ def report_failures(as_json: bool = False) -> Iterator[None]:
             PerchError.exit_code,
             as_json,
         )
+
+
+def _value_problem(error: typer.BadParameter) -> str:
+    """Return the sentence about an option's invalid value, from the first error of the library that
+    typer uses to convert values."""
+    from perchctl.plain_yaml import clip_text
+
+    param: Any = error.param
+    first: dict[str, Any] = next(iter(getattr(error.__cause__, "errors", list)()), {})
+    name, low, high = "/".join(param.opts), param.min, param.max
+    _, is_choice, allowed = error.message.partition(" is not one of ")
+    if is_choice:
+        allowed = allowed.replace("'", "").removesuffix(".")
+    else:
+        is_whole = first.get("type", "").startswith("int_") or isinstance(low, int)
+        kind = "whole numbers" if is_whole else "numbers"
+        above = "" if low is None else f" of {low:g} or more"
+        allowed = kind + (above if high is None else f" from {low:g} to {high:g}")
+    if "input" not in first:
+        return f"{name}: {error.message}"
+    return f"{name}: found {clip_text(repr(first['input']))}; allowed are {allowed}"
 
 
 def _leave(sentence: str, code: int, as_json: bool) -> NoReturn:

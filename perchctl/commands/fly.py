@@ -54,7 +54,7 @@ from perchctl.errors import (
 from perchctl.wrapping import wrap_line
 
 SeedOption = Annotated[
-    int | None, typer.Option("--seed", help="Seed of the simulated scenario. Default: 11.")
+    int | None, typer.Option("--seed", min=0, help="Seed of the simulated scenario. Default: 11.")
 ]
 LogDirOption = Annotated[
     Path | None, typer.Option("--log-dir", help="Folder for the flight log and plot.")
@@ -180,6 +180,7 @@ def with_positioning(profile: profiles.Profile, method: str | None) -> profiles.
     if method not in positioning_methods():
         raise InvalidValue(
             f"--positioning {method!r} is unknown; allowed are {', '.join(positioning_methods())}"
+            f"{profiles.PositioningConfig.deck_note(method)}"
         )
     return profile.with_({"positioning.by": method})
 

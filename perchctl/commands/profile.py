@@ -194,6 +194,8 @@ def new(
     """
     check_output(output, (".yaml", ".yml"), force, "a profile")
     say_on_terminal("reading the shipped profiles")
+    incomplete = [setting for setting in settings or () if "=" not in setting]
+    profiles.apply_settings(profiles.Profile(), incomplete)  # raises InvalidValue unless empty
     given = dict(setting.partition("=")[::2] for setting in settings or ())
     profile_and_keys(given, output.stem)  # before the first question
     answers = dict(given)

@@ -17,7 +17,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 from ruamel.yaml.error import YAMLError
 
-from perchctl.errors import InvalidValue, PerchError, UsageError
+from perchctl.errors import InvalidValue, PerchError
 from perchctl.files import check_writable, file_mode, write_files
 from perchctl.places import data_folder
 from perchctl.plain_yaml import clip_text, parse_yaml
@@ -32,8 +32,8 @@ def apply_settings(profile: Profile, settings: Iterable[str], option: str = "--s
     in YAML. `option` is the name of the command-line option in messages; empty if there is none.
 
     Raises:
-        UsageError: a setting is not ``key=value``.
-        InvalidValue: the key is unknown, or its value is not allowed.
+        InvalidValue: a setting is not ``key=value``, its key is unknown, or its value is not
+            allowed.
     """
     values: dict[str, Any] = {}
     for key, text in [_parsed(setting, option) for setting in settings]:
@@ -49,9 +49,10 @@ def apply_settings(profile: Profile, settings: Iterable[str], option: str = "--s
 
 
 def _parsed(setting: str, option: str) -> tuple[str, str]:
+    """Split ``key=value``, the value of `option`, into key and value. Raises InvalidValue."""
     key, equals, text = setting.partition("=")
     if not equals or not key.strip():
-        raise UsageError(
+        raise InvalidValue(
             f"{option} {clip_text(setting)} must be KEY=VALUE with a key of the profile, as in "
             f"{option} planner.align.xy_m=0.03"
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import Enum
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, WithJsonSchema, model_validator
+from pydantic import AfterValidator, WithJsonSchema, field_validator, model_validator
 
 from perchctl.extensions import PATTERN, has_extension_form
 from perchctl.profile.base import BodyVector3, Section, Vector3, key
@@ -38,6 +38,7 @@ System = Annotated[
     AfterValidator(_known_system),
     WithJsonSchema({"anyOf": [{"enum": list(SYSTEMS)}, {"type": "string", "pattern": PATTERN}]}),
 ]
+_DECKS = ("lighthouse", "flow", "loco", "lps", "uwb")
 BY_TARGET = {"rate_hz": 30.0, "position_sigma_m": 0.02, "hold_s": 0.5, "land_s": 1.5}
 """Other defaults for positions from images, which arrive late and with gaps."""
 
@@ -136,6 +137,13 @@ class PositioningConfig(Section):
         (), "positioning decks with your own drivers, named as `check` shows them"
     )
 
+    @staticmethod
+    def deck_note(name: object) -> str:
+        """What to write instead, for a message about the unknown position source `name`; empty
+        unless it is the name of a positioning deck."""
+        is_deck = str(name).lower().startswith(_DECKS)
+        return "; write deck: perchctl finds out which decks the vehicle has" if is_deck else ""
+
     @property
     def source(self) -> PositionSource:
         """The method as a `PositionSource`."""
@@ -156,6 +164,13 @@ class PositioningConfig(Section):
             return self.model_dump()
         kept = self.model_dump() if (self.by, by) == ("deck", "mocap") else {"decks": self.decks}
         return {**kept, "by": by}
+
+    @field_validator("by", mode="before")
+    @classmethod
+    def _names_no_deck(cls, by: object) -> object:
+        if note := cls.deck_note(by):
+            raise ValueError(f"found {by!r}; allowed are {', '.join(_SOURCES)}{note}")
+        return by
 
     @model_validator(mode="before")
     @classmethod

@@ -75,7 +75,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     [
         ([], 2, ["-p"]),
         (["-p", "no_such"], 20, ["no_such", "crazyflie"]),
-        (["-p", "mine.yaml", "--part", "both sides"], 2, ["--part", "pivot"]),
+        (["-p", "mine.yaml", "--part", "both sides"], 30, ["--part", "pivot"]),
         (["-p", "mine.yaml", "-u", "nonsense://x"], 30, ["nonsense://x", "radio://"]),
         (["-p", "mine.yaml", "-u", "sim://"], 2, ["you cannot move it", "--part pivot"]),
         (["-p", "sim"], 2, ["sim:", "you cannot move it", "--source"]),

@@ -23,7 +23,7 @@ from perchctl.campaign.compare import (
     compare_pairs,
     results_by_seed,
 )
-from perchctl.errors import InvalidValue, UsageError
+from perchctl.errors import InvalidValue
 from perchctl.profile import load_profile
 from tests.helpers.results import LANDED, PERCHED, landed, perched
 
@@ -157,9 +157,9 @@ def test_each_value_is_a_cell_and_the_profiles_own_is_the_last() -> None:
 @pytest.mark.parametrize(
     ("text", "error", "words"),
     [
-        (KEY, UsageError, "must be KEY=VALUE,VALUE"),
-        ("=1,2", UsageError, "must be KEY=VALUE,VALUE"),
-        (f"{KEY}=", UsageError, "must be KEY=VALUE,VALUE"),
+        (KEY, InvalidValue, "must be KEY=VALUE,VALUE"),
+        ("=1,2", InvalidValue, "must be KEY=VALUE,VALUE"),
+        (f"{KEY}=", InvalidValue, "must be KEY=VALUE,VALUE"),
         (f"{KEY}=0.1,[", InvalidValue, "not YAML"),
         (f"{KEY}=0.1,9", InvalidValue, "found 9"),
         ("planner.align.xx=1", InvalidValue, "allowed here are xy_m"),

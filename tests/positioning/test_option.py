@@ -24,6 +24,8 @@ def fly(*words: str) -> Result:
 
 
 @pytest.mark.parametrize(("section", "words"), [
+    *((text, "found 'Lighthouse'; allowed are deck, mocap, target; write deck")
+      for text in ("Lighthouse", "{by: Lighthouse}")),
     ("{host: lab}", "by is deck: write by: mocap"), ("{by: deck, host: lab}", "but positioning.by"),
     *((f"{{by: mocap, host: '{host}'}}", f"found '{host}'")
       for host in ("http://lab", "lab:0", "lab:x", "lab/1", "a b")),
@@ -55,6 +57,13 @@ def test_the_option_wins_over_the_profile_and_the_plan_says_so(
     assert done.exit_code == 0, done.output
     assert Profile.model_validate(json.loads(done.stdout)["profile"]).positioning.by == by
     assert f"positioning  {said}" in fly(*words, "--dry-run").stdout
+
+
+def test_the_name_of_a_deck_leads_to_deck() -> None:
+    done = fly("--positioning", "lighthouse")
+    assert done.exit_code == 30
+    assert "allowed are deck, mocap, target; write deck" in done.stderr
+    assert "write deck" not in fly("--positioning", "gps").stderr
 
 
 def test_the_target_brings_its_own_limits_and_leaves_none_behind() -> None:

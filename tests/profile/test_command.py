@@ -194,7 +194,7 @@ def test_a_password_is_in_the_source_alone(tmp_path: Path) -> None:
 
 WRONG: dict[str, tuple[str, str]] = {
     "link.uri": ("bogus", "radio://0/80/2M"),
-    "positioning.by": ("flow", "must be deck, mocap or target, found 'flow'"),
+    "positioning.by": ("flow", "allowed are deck, mocap, target; write deck"),
     "camera.source": ("webcam:0", "camera:N"),
     "camera.calibration": ("none.yaml", "give a path"),
     "camera.latency_s": ("80", "allowed are 0 to 1"),

@@ -180,4 +180,4 @@ def test_no_data_no_file_and_a_test_by_the_data_itself(session: Path, tmp_path: 
     assert run().exit_code == 2
     assert run(tmp_path / "none.csv").exit_code == 20
     assert run(session, "--test", session).exit_code == 30
-    assert run("x.csv", "--method", "magic").exit_code == 2
+    assert run("x.csv", "--method", "magic").exit_code == 30
