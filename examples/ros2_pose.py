@@ -13,23 +13,23 @@ import json
 import socket
 from typing import Any
 
-import rclpy
-from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
-from rclpy.time import Time
-from tf2_ros import TransformBroadcaster
+try:
+    import rclpy
+    from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+    from rclpy import executors, node, time
+    from tf2_ros import TransformBroadcaster
+except ModuleNotFoundError as error:
+    raise SystemExit(f"no {error.name}: source the setup.bash of ROS 2 first") from None
 
 
-class TargetPose(Node):
+class TargetPose(node.Node):
     def __init__(self, receiver: socket.socket) -> None:
         super().__init__("perchctl_target")
-        host = self.declare_parameter("host", "127.0.0.1").value
-        port = self.declare_parameter("port", 9870).value
         self._poses = self.create_publisher(PoseWithCovarianceStamped, "target_pose", 10)
         self._transforms = TransformBroadcaster(self)
         self._receiver, self._note = receiver, ""
-        receiver.bind((host, port))
+        address = ("host", "127.0.0.1"), ("port", 9870)
+        receiver.bind(tuple(self.declare_parameter(*default).value for default in address))
         receiver.settimeout(0.1)  # s; without poses, the node serves Ctrl-C at this interval
 
     def receive(self) -> None:
@@ -50,9 +50,9 @@ class TargetPose(Node):
             self._transforms.sendTransform(messages[1])
 
     def _messages(self, pose: dict[str, Any], unix_s: float | None) -> tuple[Any, Any]:
-        time = self.get_clock().now() if unix_s is None else Time(nanoseconds=round(unix_s * 1e9))
+        t = self.get_clock().now() if unix_s is None else time.Time(nanoseconds=round(unix_s * 1e9))
         message, transform = PoseWithCovarianceStamped(), TransformStamped()
-        message.header.stamp, message.header.frame_id = time.to_msg(), pose["frame_id"]
+        message.header.stamp, message.header.frame_id = t.to_msg(), pose["frame_id"]
         transform.header, transform.child_frame_id = message.header, pose["child_frame_id"]
         for place in (message.pose.pose.position, transform.transform.translation):
             place.x, place.y, place.z = pose["position_m"]
@@ -66,11 +66,11 @@ def main() -> None:
     rclpy.init()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         try:
-            node = TargetPose(receiver)
+            publisher = TargetPose(receiver)
             while rclpy.ok():
-                node.receive()
-                rclpy.spin_once(node, timeout_sec=0.0)
-        except (KeyboardInterrupt, ExternalShutdownException):
+                publisher.receive()
+                rclpy.spin_once(publisher, timeout_sec=0.0)
+        except (KeyboardInterrupt, executors.ExternalShutdownException):
             pass
         finally:
             rclpy.try_shutdown()

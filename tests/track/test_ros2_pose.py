@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import socket
+import subprocess
 import sys
 from collections.abc import Iterator
 from importlib import import_module
@@ -55,6 +56,16 @@ def node(patch: pytest.MonkeyPatch, port: int) -> tuple[Ros2, ModuleType]:
     module = import_module("ros2_pose")
     patch.delitem(sys.modules, "ros2_pose")
     return ros, module
+
+
+def test_without_ros_it_is_one_sentence() -> None:
+    blocked = "import sys; sys.modules['rclpy'] = None; import ros2_pose"
+    done = subprocess.run(
+        [sys.executable, "-c", blocked], cwd=ROOT / "examples", capture_output=True, text=True
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("no rclpy: source the setup.bash of ROS 2 first")
+    assert len(done.stderr.splitlines()) == 1
 
 
 def published(
@@ -168,7 +179,7 @@ def test_the_node_ends_with_ros_or_by_ctrl_c_and_waits_for_poses(
     ros, module = node
     ros.steps = [lambda: None] * 2  # nothing arrives
     assert published(node, port) == ([], [])
-    for error in (KeyboardInterrupt(), module.ExternalShutdownException()):
+    for error in (KeyboardInterrupt(), module.executors.ExternalShutdownException()):
         patch.setattr(ros, "error", error)
         published(node, port)
     patch.setattr(ros, "error", None)
