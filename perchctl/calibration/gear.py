@@ -31,11 +31,11 @@ _DILATION_PX = 3  # margin for blur around the gear; larger: more is covered tha
 def learn_gear_mask(
     source: FrameSource, stopped: Callable[[], bool] = lambda: False
 ) -> NDArray[np.bool_]:
-    """Return the mask (h, w) of the pixels that the vehicle covers. The images come from a
-    recording, or from a live camera for `LIVE_S` or until `stopped` returns True.
+    """Return the mask (h, w) of the pixels that the vehicle covers, possibly none. The images come
+    from a recording, or from a live camera for `LIVE_S` or until `stopped` returns True.
 
     Raises:
-        InvalidValue: too few images, unequal sizes, too little motion, or nothing found.
+        InvalidValue: too few images, unequal sizes, or too little motion.
     """
     count, start_s = 0, time.monotonic()
     total = squares = np.zeros((0, 0))
@@ -65,11 +65,6 @@ def learn_gear_mask(
         raise InvalidValue(
             "the images hardly change: turn the vehicle around where strong patterns "
             "fill the image, not in front of a plain wall"
-        )
-    if share == 0.0:
-        raise InvalidValue(
-            "no part of the image stays the same, so the vehicle covers none of it: "
-            "camera.mask is not needed"
         )
     return covered
 

@@ -150,7 +150,10 @@ def mask(
     force: ForceOption = False,
     size: SizeOption = None,
 ) -> None:
-    """While you turn the vehicle in your hand, find the parts of the image that it covers."""
+    """While you turn the vehicle in your hand, find the parts of the image that it covers.
+
+    If it covers none, you need no mask: perchctl says so, writes no file, and the exit code is 0.
+    """
     say_on_terminal("looking for the parts that the vehicle covers")
     pictures = _source(source)
     check_output(output, (".png",), force, "a mask")
@@ -161,6 +164,12 @@ def mask(
         if frames.live:
             say("turn the vehicle around in your hand for 20 s (Ctrl-C stops and writes the mask)")
         covered = calibrations.learn_gear_mask(frames, stop.requested.is_set)
+    if not covered.any():
+        say(
+            "the vehicle covers no part of the image, so camera.mask is not needed: "
+            f"{output} was not written"
+        )
+        return
     import cv2
 
     write_files({output: cv2.imencode(".png", 255 * covered.astype("uint8"))[1].tobytes()})
