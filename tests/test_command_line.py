@@ -23,6 +23,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl import __version__
 from perchctl.commands.command_line import COMMANDS, report_failures
 from perchctl.commands.output import ask, ask_to_confirm, say
+from perchctl.commands.progress import done_of_total_bar
 from perchctl.errors import EXIT_CODES, InvalidValue, ProfileNote, UsageError
 from perchctl.startup import is_command_line
 from tests.helpers.commands import elsewhere, run, run_apart  # noqa: F401
@@ -304,16 +305,29 @@ def test_options_that_would_not_be_heeded_are_refused(line: str, words: list[str
 # --- On a terminal -------------------------------------------------------------------------
 
 
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(("total", "shown"), [(None, " 2"), (3, " 2/3")])
+def test_a_bar_shows_the_total_if_it_is_known(
+    total: int | None, shown: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    screen = Terminal()
+    monkeypatch.setattr("sys.stderr", screen)
+    with done_of_total_bar("flights", total) as progress:
+        progress(2, total)
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", screen.getvalue())
+    assert text.rstrip().endswith(shown)
+
+
 def test_a_message_breaks_between_words_but_only_on_a_terminal(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     path = "/home/somebody/" + "a_long_folder/" * 7 + "flight.jsonl"
     copied = "  SUBSYSTEM==usb, " + "ATTRS==1915, " * 8 + "MODE==0664"
     sentence = f"the newest log of all the flights that were flown today: {path}: it ends\n{copied}"
-
-    class Terminal(io.StringIO):
-        def isatty(self) -> bool:
-            return True
 
     monkeypatch.setenv("COLUMNS", "80")
     terminal, pipe = Terminal(), io.StringIO()
@@ -429,7 +443,7 @@ LOG = '{"kind":"header","format":"perchctl-flight-log","version":3}\n{}\n'
         ),
         ("track a.jsonl", "neither a picture nor a video (it is a flight log)"),
         ("fit-weights a.jsonl", "(it is a flight log)"),
-        (f"log show {ROOT}/profiles/sim.yaml", "(it is a profile)"),
+        (f"log show {ROOT}/profiles/sim.yaml", "not a perchctl flight log (it is a profile);"),
     ],
 )
 def test_a_file_of_another_kind_is_named(line: str, words: str) -> None:

@@ -283,7 +283,8 @@ def report(
     place = _place(logs[0], output, PAGES, force)
     from perchctl.commands.progress import done_of_total_bar
 
-    with done_of_total_bar("images of a film" if with_film else "flights") as progress:
+    label, total = ("images of a film", None) if with_film else ("flights", len(logs))
+    with done_of_total_bar(label, total) as progress:
         page = analysis.write_report(logs, place, with_film, names, progress)
     say(page.outcome_counts_text)
     print_result({"report": str(place), "flights": page.record()} if as_json else place)

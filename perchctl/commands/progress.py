@@ -14,9 +14,9 @@ from rich.console import Console
 from rich.live import Live
 from rich.progress import (
     BarColumn,
-    MofNCompleteColumn,
     Progress,
     ProgressColumn,
+    Task,
     TextColumn,
     TimeRemainingColumn,
 )
@@ -72,10 +72,21 @@ def count_bar(label: str, total: int | None, is_shown: bool = True) -> Iterator[
 
 
 @contextlib.contextmanager
-def done_of_total_bar(label: str) -> Iterator[Callable[[int, int | None], None]]:
-    """Show a progress bar; yield the function that sets the number done and the total."""
-    with _bar(label) as update:
+def done_of_total_bar(
+    label: str, total: int | None = None
+) -> Iterator[Callable[[int, int | None], None]]:
+    """Show a progress bar; yield the function that sets the number done and the total. `total`:
+    the total until then, None if unknown."""
+    with _bar(label, total=total) as update:
         yield lambda done, total: update(completed=done, total=total)
+
+
+class _DoneOfTotalColumn(ProgressColumn):
+    """The number done, and the total if it is known."""
+
+    def render(self, task: Task) -> Text:
+        of = "" if task.total is None else f"/{int(task.total)}"
+        return Text(f"{int(task.completed)}{of}", style="progress.download")
 
 
 @contextlib.contextmanager
@@ -94,7 +105,7 @@ def _bar(
     with Progress(
         TextColumn(label),
         BarColumn(width),
-        MofNCompleteColumn(),
+        _DoneOfTotalColumn(),
         *more,
         console=console,
         redirect_stdout=False,

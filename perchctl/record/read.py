@@ -26,7 +26,7 @@ from pydantic import ValidationError
 
 from perchctl import __version__
 from perchctl.errors import InvalidValue, Note, NotFound
-from perchctl.files import file_kind
+from perchctl.files import kind_note
 from perchctl.geometry import Array
 from perchctl.mission import SentCommand, TickRecord
 from perchctl.profile import Profile, key_and_reason
@@ -411,9 +411,10 @@ def _header(path: Path, lines: list[bytes]) -> dict[str, Any]:
     except (IndexError, ValueError):
         header = {}
     if header.get("kind") != "header" or header.get("format") != FORMAT:
+        kind = kind_note(path, "a flight log", "a JSON file") or ", or truncated in its header"
         raise InvalidValue(
-            f"{path}: line 1: not a perchctl flight log, or truncated in its header (it is "
-            f"{file_kind(path)}); logs are the .jsonl files in the profile's log.directory"
+            f"{path}: line 1: not a perchctl flight log{kind}; logs are the .jsonl files in "
+            "the profile's log.directory"
         )
     version = header.get("version")
     if version not in READABLE_VERSIONS:
