@@ -58,7 +58,10 @@ def show_text(flight: FlightAnalysis) -> str:
     phases = flight.log.phases
     for head, rows in (
         ("phase     why", [(stay, stay.phase, _why(stay)) for stay in phases]),
-        ("held in   because", [(hold, hold.phase, hold.reason) for hold in flight.position_holds]),
+        (
+            "held in   because (figures at the end of the hold)",
+            [(hold, hold.phase, hold.reason) for hold in flight.position_holds],
+        ),
         ("sent by   commands (count)", [(go, go.by, go.text) for go in flight.takeovers]),
     ):
         if rows:
@@ -100,7 +103,7 @@ def _origin(log: FlightLog) -> str:
         _positions_text(log),
         f"{header.get('uri', '?')} with {header.get('source', '?')}",
         "" if not started else f"started {utc_text(started)}",
-        f"perchctl {header.get('perchctl', '?')}, version {header.get('version')}",
+        f"perchctl {header.get('perchctl', '?')}, log format version {header.get('version')}",
     ]
     return ", ".join(part for part in parts if part)
 

@@ -104,9 +104,15 @@ def check_size(size_px: tuple[int, int] | None, camera: CameraModel, source: str
     """
     if size_px is None or size_px == camera.size_px:
         return
+    size = f"{size_px[0]}x{size_px[1]} px"
+    is_named = size in source  # the description of a recording contains its size
+    found = (
+        "does not fit the calibration, which"
+        if is_named
+        else (f"delivers frames of {size}, but the calibration")
+    )
     raise InvalidValue(
-        f"{source} delivers frames of {size_px[0]}x{size_px[1]} px, but the calibration was made "
-        f"at {camera.size_px[0]}x{camera.size_px[1]} px",
+        f"{source} {found} was made at {camera.size_px[0]}x{camera.size_px[1]} px",
         "set the camera to the calibrated size, or calibrate it at the current size",
     )
 

@@ -205,12 +205,12 @@ def _result(future: Future[R], seed: object, lost: tuple[type[BaseException], ..
     except lost as error:
         raise PerchError(
             "a flight's process was killed; if memory is short, run fewer flights at a time "
-            "(--jobs); to continue the file given with --out, add --resume"
+            "(--jobs); if you gave --out, add --resume to continue its file"
         ) from error
     except CancelledError as error:
         raise ConnectionFailed(
-            "the scheduler given with --cluster no longer answers: restart it, and add --resume "
-            "to continue the file given with --out"
+            "the scheduler given with --cluster no longer answers: restart it; if you gave --out, "
+            "add --resume to continue its file"
         ) from error
     except ImportError as error:
         raise InvalidValue(

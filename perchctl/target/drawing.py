@@ -234,7 +234,8 @@ def print_scale(
     off = scale - 1.0
     if abs(off) > MAX_SCALE_ERROR:
         raise InvalidValue(
-            f"{option}: {mm_text(measured_m)} mm is {100 * off:+.0f} % off the "
+            f"{option}: {mm_text(measured_m)} mm is {100 * abs(off):.0f} % "
+            f"{'larger' if off > 0.0 else 'smaller'} than the "
             f"{mm_text(spec_m)} mm of {source}: measure the black area, in mm"
         )
     notes = [f"{name}: {mm_text(measured_m)} mm, {100 * off:+.2f} % against {mm_text(spec_m)} mm"]

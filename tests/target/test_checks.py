@@ -116,7 +116,7 @@ def test_a_measured_print_moves_the_corners_along_each_side_for_itself() -> None
         ("chessboard:2x6:25mm", "3 to 100"),
         ("circles:9x6:25mm", "chessboard:COLUMNSxROWS"),
         ("chessboard:9x6:25mm:measured=25x17cm", "not WIDTHxHEIGHT in mm"),
-        ("chessboard:9x6:25mm:measured=25x17.5mm", "-90 % off the 250 mm"),
+        ("chessboard:9x6:25mm:measured=25x17.5mm", "90 % smaller than the 250 mm"),
         ("charuco:10x7:25mm:25mm:DICT_5X5_100", "needs a white margin"),
         ("charuco:10x7:25mm:18mm:DICT_9X9", "is unknown"),
         ("charuco:20x17:25mm:18mm:DICT_5X5_100", "170 markers are needed"),

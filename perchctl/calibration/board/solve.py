@@ -343,4 +343,5 @@ def _uncovered_text(covered: NDArray[np.bool_]) -> str:
         for cell, name in zip(np.array_split(row, 3, axis=1), names, strict=True)
     ]
     empty = [name for share, name in sorted(thirds) if share < 0.6][:4]
-    return f"at the {' and '.join(empty) or 'edges'}"
+    *others, last = empty or ["edges"]
+    return f"at the {', '.join(others)} and {last}" if others else f"at the {last}"
