@@ -198,7 +198,7 @@ def test_a_deck_without_a_whole_picture_is_not_called_a_receiver(
 def test_a_deck_that_is_not_there_is_not_told_to_be_switched(deck: AiDeck) -> None:
     deck.close()
     with pytest.raises(
-        TimedOut, match="connection refused: check that this computer is in the deck's Wi-Fi"
+        TimedOut, match="connection refused: check that this computer is on the deck's Wi-Fi"
     ):
         open_camera(deck.url, Clock(), timeout_s=0.3)
 
