@@ -119,7 +119,7 @@ def test_the_camera_of_another_vehicle_is_named(sim: SimProcess, relay: Relay) -
 
 @pytest.mark.parametrize(("expected_x_m", "words", "advice"), [
     (0.1, "its target is not detected, although its expected position is in the image", "its ids"),
-    (5.0, "its target is not detected", "move home_m closer to the target: at most"),
+    (5.0, "its target is not detected", "nearer to its target and correct home_m: the large"),
 ])  # fmt: skip
 def test_a_target_that_is_not_detected_is_not_called_out_of_view(
     expected_x_m: float, words: str, advice: str

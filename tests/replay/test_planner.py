@@ -18,7 +18,7 @@ import perchctl
 from perchctl.analysis import replay
 from perchctl.analysis.decide import Comparison
 from perchctl.analysis.replayer import CAUTION, Replay, changed_keys
-from perchctl.errors import EXIT_CODES, InvalidValue, ReplayDiffers, UsageError
+from perchctl.errors import EXIT_CODES, InvalidValue, ReplayDiffers
 from perchctl.mission import TickRecord, setpoints, step_mission
 from perchctl.profile import Profile, apply_settings
 from perchctl.record import FlightLog, LogWatcher, json_line, read_log
@@ -246,15 +246,10 @@ def test_what_if_names_the_first_tick_that_would_differ(logs: Logs) -> None:
 
 
 @pytest.mark.parametrize(
-    ("setting", "error"),
-    [
-        ("planner.align.xy_m", UsageError),
-        ("planner.align.xy=3", InvalidValue),
-        ("planner.align.xy_m=[", InvalidValue),
-    ],
+    "setting", ["planner.align.xy_m", "planner.align.xy=3", "planner.align.xy_m=["]
 )
-def test_a_setting_that_is_none(setting: str, error: type[Exception]) -> None:
-    with pytest.raises(error, match="--set"):
+def test_a_setting_that_is_none(setting: str) -> None:
+    with pytest.raises(InvalidValue, match="--set"):
         apply_settings(Profile(), [setting])
 
 
