@@ -126,8 +126,8 @@ MIN_DEPTH_BELOW_GROUND_TO_EXTEND_LANDING_M = 0.1
 ground is lower, m. Larger: a trajectory ends before it is extended. Smaller: the error of a height
 without drift extends the landing."""
 MIN_THRUST_TO_HOVER_RATIO_IF_FLYING = 0.85
-"""Thrust that shows during the firmware's landing that the vehicle is still flying, as a fraction
-of the hover thrust. Once the vehicle is on the floor, and therefore above the end of its
+"""Thrust, as a fraction of the hover thrust, from which a vehicle that the firmware is landing
+counts as still flying. Once the vehicle is on the floor, and therefore above the end of its
 trajectory, the firmware commands its smallest thrust. Larger: a vehicle that sinks faster and
 faster counts as landed. Smaller: a vehicle that has just touched down counts as flying."""
 MAX_HEIGHT_DRIFT_IN_LANDING_GOAL_M = 1.0

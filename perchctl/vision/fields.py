@@ -21,7 +21,7 @@ from perchctl.vision.types import FieldState, Frame
 
 GreyImage = NDArray[np.uint8]
 
-# Minimum ratio of the energy of strong differences between the two fields to the energy within the
+# Minimum ratio of the energy of strong row differences between the two fields to that within the
 # fields. Fields displaced by one pixel exceed this ratio.
 _MIN_INTER_TO_INTRA_FIELD_ENERGY_RATIO = 1.4
 # Number of rows per group. All rows of a group, except the outer two at each end, are compared with

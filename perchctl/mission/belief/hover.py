@@ -112,8 +112,9 @@ def learn_hover_thrust_in_descent(b: Belief, dt_s: float) -> HoverThrust:
     """Return the hover thrust (0..65535) after a tick of a descent by raw thrust: a Kalman update
     with the thrust that the rotors produce, which lags the reported thrust, divided by the specific
     force along the body's z axis in g. `dt_s` is defined as in
-    `learn_hover_thrust_in_quiet_flight`. The result is clamped to a multiple of its standard
-    deviation around the thrust before the descent.
+    `learn_hover_thrust_in_quiet_flight`. The result is clamped to within
+    `MAX_HOVER_THRUST_CORRECTION_IN_DESCENT_SIGMAS` standard deviations of the estimate from before
+    the descent.
 
     The estimate does not change while the floor or a magnet may support part of the weight, or
     while the telemetry is too old or outside the range in which thrust is proportional to force.
