@@ -20,7 +20,7 @@ from perchctl.analysis.film import Progress, write_film
 from perchctl.analysis.flight import FlightAnalysis
 from perchctl.analysis.plot import flight_png
 from perchctl.analysis.show import utc_text
-from perchctl.analysis.story import Sentence, count_text, length_text, tell_story
+from perchctl.analysis.story import Sentence, count_text, height_text, length_text, tell_story
 from perchctl.errors import InvalidValue, PerchError
 from perchctl.files import write_files
 from perchctl.mission import Phase
@@ -306,7 +306,7 @@ def captions_and_records(flight: FlightAnalysis) -> dict[int, tuple[str, dict[st
         if stay.phase in DECIDED and record is not None:
             caption = f"{DECIDED[stay.phase]}, {log.to_flight_s(float(record['t_s'])):.1f} s"
             if record.get("ez_m") is not None:
-                caption += f", {length_text(float(record['ez_m']))} below"
+                caption += f", {height_text(float(record['ez_m']))}"
             found[int(record["frame"])] = caption, record
     return found
 

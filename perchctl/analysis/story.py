@@ -89,7 +89,7 @@ def _where(flight: FlightAnalysis, t_s: float) -> str:
     aside_m = math.hypot(flight.value_at(t_s, "ex_m"), flight.value_at(t_s, "ey_m"))
     if not math.isfinite(up_m + aside_m):
         return ""
-    return f", {length_text(up_m)} below the target and {length_text(aside_m)} off centre"
+    return f", {height_text(up_m)} the target and {length_text(aside_m)} off centre"
 
 
 def _loss(loss: TargetLoss) -> Sentence:
@@ -148,6 +148,12 @@ def _upper(sentence: str) -> str:
 
 
 # --- Numbers in readable form ---
+
+
+def height_text(below_m: float) -> str:
+    """How far the gear is below a target: ``31 cm below``. At a contact, the noise of the estimate
+    may place it above: ``1.3 mm above``."""
+    return f"{length_text(abs(below_m))} {'below' if below_m >= 0.0 else 'above'}"
 
 
 def length_text(metres: float) -> str:

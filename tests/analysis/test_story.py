@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from perchctl.analysis import FlightAnalysis
-from perchctl.analysis.story import ACTIONS, FINAL_PHASE_TEXTS, Sentence, tell_story
+from perchctl.analysis.story import ACTIONS, FINAL_PHASE_TEXTS, Sentence, height_text, tell_story
 from perchctl.mission import Phase
 from tests.helpers.log import GONE_S, PLAN
 from tests.helpers.mission import note
@@ -35,6 +35,14 @@ def test_each_phase_has_its_sentence_at_its_time() -> None:
     assert [s.t_s for s in steps] == pytest.approx(begins, abs=0.03)
     assert steps[2].text.startswith("Target seen, 1.02 m below the target and ")
     assert steps[4].text.endswith("off centre: it climbed")
+
+
+@pytest.mark.parametrize(
+    ("below_m", "text"),
+    [(0.31, "31 cm below"), (0.0, "0.0 mm below"), (-0.0013, "1.3 mm above")],
+)
+def test_a_height_has_no_sign(below_m: float, text: str) -> None:
+    assert height_text(below_m) == text
 
 
 def nothing(record: dict[str, Any]) -> None:
