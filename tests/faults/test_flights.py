@@ -121,6 +121,10 @@ def test_nothing_goes_wrong(name: str, phase: Phase, by: str) -> None:
     [
         ("sim", 21211562),  # a drifting height: a landing of its own ended in the air
         ("target_only", 21201418),  # the firmware turned by the jump, on motors at their limit
+        ("sim", 2612010094),  # a contact proven late: pressed for 4.2 s
+        ("target_only", 2612011472),  # a descent on a hover thrust that was 15 % too small
+        ("target_only", 2612021064),  # the notify after the last stop was lost: locked
+        ("target_only", 2612021214),  # restarted on the magnet, and reported to be on the floor
     ],
 )
 def test_nothing_goes_wrong_any_more_in_a_seed_of_a_campaign(name: str, seed: int) -> None:
