@@ -153,7 +153,7 @@ def _upper(sentence: str) -> str:
 def height_text(below_m: float) -> str:
     """How far the gear is below a target: ``31 cm below``. At a contact, the noise of the estimate
     may place it above: ``1.3 mm above``."""
-    return f"{length_text(abs(below_m))} {'below' if below_m >= 0.0 else 'above'}"
+    return f"{length_text(abs(below_m))} {'above' if below_m <= -5e-5 else 'below'}"
 
 
 def length_text(metres: float) -> str:

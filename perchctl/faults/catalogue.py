@@ -586,7 +586,18 @@ class Case:
     def text_at(self, begins: str) -> str:
         """The fault and the values drawn for it, in words, with another text for its time."""
         drawn = "; ".join(map(_effect_text, self.effects))
-        return f"{self.fault.name}, {begins}: {self.fault.description} ({drawn})"
+        text = f"{self.fault.name}, {begins}: {self.fault.description} ({drawn})"
+        if self.landed_from is not None:
+            text += (
+                f"; to reach this phase, the operator ended {self.landed_from.value} after "
+                f"{self.landed_after_s:.1f} s"
+            )
+        if self.first_hold_ratio is not None:
+            text += (
+                f"; to reach this phase, the magnet held only {self.first_hold_ratio:.2f} of the "
+                "weight at the first contact"
+            )
+        return text
 
     @property
     def lasts_s(self) -> float:

@@ -113,6 +113,7 @@ EXPECTED_OUTCOMES = (
         "released in silence",
         "0.5 s after the last setpoint the firmware replaces it; the magnet then let go",
         lambda facts: facts.released_in_silence_s,
+        within_s=2.0,
     ),
     ExpectedOutcome(
         "too low to catch",

@@ -51,8 +51,9 @@ SLOW_AGAIN_S = 0.3
 """A fall also ends once the sink rate has been below `FAST_MPS` for this time, s. Larger: the
 descent that follows counts as part of the fall."""
 USUAL_THRUST_RESERVE = 0.165
-"""Thrust reserve of a vehicle of 42 g with the motors of the data sheet. Larger: deeper falls of
-ordinary vehicles are accepted."""
+"""Thrust reserve of a vehicle of 42 g with the motors of the data sheet; a quarter of the simulated
+vehicles have less, because the weakest motor counts. Larger: deeper falls of ordinary vehicles are
+accepted."""
 LEAST_THRUST_RESERVE = 0.05
 """Smallest thrust reserve with which a vehicle can catch itself at all. Smaller: a vehicle that can
 hardly fly may fall to the floor."""
@@ -117,12 +118,17 @@ class Sample(NamedTuple):
 def drop_limit_m(hold_ratio: float, thrust_reserve: float = math.inf) -> float:
     """The depth, m, to which the vehicle may fall after slipping off the magnet. `hold_ratio` is
     the magnet's holding force divided by the weight, and `thrust_reserve` the largest thrust
-    divided by the weight, minus 1: the distance in which a fall is braked is inversely proportional
-    to it. With less than `USUAL_THRUST_RESERVE`, the vehicle may therefore fall deeper."""
-    limit_m = 1.0
-    if hold_ratio <= 0.75:
-        limit_m = 0.6 if hold_ratio > 0.3 else 0.15
-    return limit_m * max(1.0, USUAL_THRUST_RESERVE / max(thrust_reserve, LEAST_THRUST_RESERVE))
+    divided by the weight, minus 1.
+
+    Half of the limit is for the fall until the thrust has returned, and half for braking. The
+    braking distance is inversely proportional to the thrust reserve, so with less than
+    `USUAL_THRUST_RESERVE`, the vehicle may fall deeper. After a slip from a magnet that held almost
+    nothing, the motors are running, and the fall ends before it has to be braked.
+    """
+    if hold_ratio <= 0.3:
+        return 0.15
+    braking = USUAL_THRUST_RESERVE / max(thrust_reserve, LEAST_THRUST_RESERVE)
+    return (0.6 if hold_ratio <= 0.75 else 1.0) * (0.5 + 0.5 * max(1.0, braking))
 
 
 def emergency_stop_s(presses_s: Sequence[float]) -> float | None:
@@ -295,6 +301,7 @@ class Oracle:
         before = self._before
         if before is not None and before.on_floor and not s.on_floor:
             self._hops = not (before.motors_on or s.motors_on)
+        self._hops = self._hops and not s.motors_on
         if before is None or before.on_floor or not s.on_floor or self._hops:
             return
         if -before.vz_mps > TOUCHDOWN_MPS:

@@ -211,7 +211,8 @@ class FactsRecorder(Facts):
             )
         came_off = before is not None and before.hanging and not s.hanging
         silent = self._silent_s is not None and s.t_s - self._silent_s >= LEVELS_S
-        if came_off and silent and self.released_in_silence_s is None:
+        replaced = silent and not self._landed_alone and s.motors_on  # the program's setpoint
+        if came_off and replaced and self.released_in_silence_s is None:
             self.released_in_silence_s = s.t_s
         if came_off and not s.motors_on and self.slipped_s is None:
             self.slipped_s, self.slip_height_m = s.t_s, s.height_m

@@ -46,7 +46,7 @@ from perchctl.mission.level_descent import (
     MIN_COMMANDED_TO_HOVER_THRUST_RATIO,
     MIN_DISTANCE_BELOW_CONTACT_WHEN_DETACHED_M,
     descend_level_by_raw_thrust,
-    should_wait_for_climb_rate,
+    should_begin_with_setpoints,
 )
 from perchctl.mission.observation import Observation
 from perchctl.mission.observe import observe
@@ -429,8 +429,8 @@ def _descend_by_setpoints(c: Context) -> Action:
 
 
 def _descend_by_raw_thrust(c: Context) -> Action:
-    """Descend level by raw thrust. While neither climb rate nor hover thrust is known well enough,
-    descend by setpoints.
+    """Descend level by raw thrust. With old telemetry and a hover thrust that is not known well
+    enough, descend by setpoints at first (`should_begin_with_setpoints`).
 
     In a tick in which the estimated heading jumps, one setpoint with the new heading is sent
     instead. Under raw thrust, the firmware keeps the heading setpoint that it received last, so it
@@ -451,7 +451,7 @@ def _descend_by_raw_thrust(c: Context) -> Action:
             return replace(c.state, descent=descent, setpoint=setpoint), setpoint
     return (
         _descend_by_setpoints(c)
-        if should_wait_for_climb_rate(c)
+        if should_begin_with_setpoints(c)
         else descend_level_by_raw_thrust(c)
     )
 

@@ -51,8 +51,8 @@ SINK_RATE_SETPOINT_IF_CAMERA_GUIDED_MPS = 0.4
 """Sink rate setpoint if the vertical speed comes from pictures, which do not show the distance to
 the floor, m/s. Larger: the vehicle lands harder. Smaller: it drifts for longer."""
 MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS = 0.2
-"""Sink rate measured from pictures below which the vehicle counts as not sinking, m/s; the error of
-single detections is half as large."""
+"""Sink rate measured from pictures below which the vehicle counts as not sinking, and climb rate
+below which it counts as not climbing, m/s; the error of single detections is half as large."""
 BRAKE_TILT_GAIN_IF_CAMERA_GUIDED_RAD_PER_MPS = 0.15
 """Tilt per lateral speed measured from pictures, rad per m/s. Larger: the vehicle oscillates, since
 the tilt itself looks like a motion. Smaller: it drifts further."""
@@ -175,7 +175,7 @@ def _climb_rate_measurement_age_s(c: Context) -> float:
     return max(1e-3, _clamped_time_since_last_tick_s(c), c.t_s - _climb_rate_measured_at_s(c))
 
 
-def should_wait_for_climb_rate(c: Context) -> bool:
+def should_begin_with_setpoints(c: Context) -> bool:
     """True if, before the first command of raw thrust, the telemetry is old and the hover thrust is
     not known well enough for a descent by raw thrust; in that case, the vehicle descends by
     setpoints, for at most `MAX_DURATION_OF_DESCENT_BY_SETPOINTS_S`. A climb rate from pictures is
@@ -186,6 +186,10 @@ def should_wait_for_climb_rate(c: Context) -> bool:
         and c.belief.hover_thrust_estimate.is_imprecise
     )
     is_old = c.t_s - c.telemetry.t_s > hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S
+    # Setpoints follow the estimate. If it is known to be wrong, pictures are the better guide.
+    misled = c.belief.is_position_diverged or c.belief.is_heading_lost
+    if misled and _visual_motion_if_telemetry_old(c) is not None:
+        return False
     return is_old and begins_rough and c.time_in_phase_s < MAX_DURATION_OF_DESCENT_BY_SETPOINTS_S
 
 
@@ -219,7 +223,11 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
     thrust = _compute_thrust_for_sink_rate(c, hover_thrust, climb_mps, height_m)
     if age_s > hover.MAX_TELEMETRY_AGE_TO_LEARN_HOVER_THRUST_S:
         thrust *= THRUST_FACTOR_IF_CLIMB_RATE_UNKNOWN
-    floor_detected_at_s = _find_floor_detection_time_s(c, height_m, measured_mps)
+    # Since the first command that is too weak, not since the last one that was not: while the loop
+    # stands still, the vehicle keeps the thrust that it received last.
+    begins = descent.last_commanded_raw_thrust == 0.0
+    too_weak_since_s = math.inf if begins else descent.too_weak_to_fly_since_s
+    floor_detected_at_s = _find_floor_detection_time_s(c, height_m, measured_mps, too_weak_since_s)
     touched_s = math.inf if floor_detected_at_s is None else c.t_s - floor_detected_at_s
     # In the air, the accelerometer reading is proportional to the thrust; on the floor, it is 1 g.
     falls = b.is_imu_fresh and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover_thrust)
@@ -258,9 +266,7 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
         descent=replace(
             descent,
             last_commanded_raw_thrust=thrust,
-            supporting_thrust_commanded_at_s=c.t_s
-            if supports
-            else descent.supporting_thrust_commanded_at_s,
+            too_weak_to_fly_since_s=math.inf if supports else min(c.t_s, too_weak_since_s),
             floor_detected_at_s=floor_detected_at_s,
             climb_rate_change_not_yet_measured_mps=climb_rate_change_not_yet_measured_mps,
             climb_rate_measured_at_s=measured_s,
@@ -286,14 +292,16 @@ def _last_measured_climb_mps(c: Context) -> float:
     return 0.0 if held else c.belief.climb_mps
 
 
-def _find_floor_detection_time_s(c: Context, height_m: float, measured_mps: float) -> float | None:
+def _find_floor_detection_time_s(
+    c: Context, height_m: float, measured_mps: float, too_weak_since_s: float
+) -> float | None:
     """Return the time at which the floor was first detected; None if it was not.
 
     The floor is detected by an impact from below while the vehicle was sinking and its height above
     the ground (`height_m`) was less than `MAX_FLOOR_IMPACT_HEIGHT_M`; or by pictures in which the
     vehicle does not sink (`measured_mps`), clearly below the target, although its thrust has been
-    too low to support it for `SEEN_STANDING_DWELL_S`. A shorter time is not enough: a small thrust
-    also brakes a climb.
+    too low to support it since `too_weak_since_s`, for at least `SEEN_STANDING_DWELL_S`. A shorter
+    time is not enough: a small thrust also brakes a climb.
     """
     descent, b, seen = c.state.descent, c.belief, _visual_motion_if_telemetry_old(c)
     if descent.floor_detected_at_s is not None:
@@ -305,7 +313,7 @@ def _find_floor_detection_time_s(c: Context, height_m: float, measured_mps: floa
     stands = (
         seen is not None
         and seen.gear_to_target_level_m[2] > MIN_SEEN_GEAR_BELOW_TARGET_IF_DETACHED_M
-        and c.t_s - descent.supporting_thrust_commanded_at_s >= SEEN_STANDING_DWELL_S
+        and c.t_s - too_weak_since_s >= SEEN_STANDING_DWELL_S
         and measured_mps > -MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS
     )
     return c.t_s if stands or (struck and height_m < MAX_FLOOR_IMPACT_HEIGHT_M) else None

@@ -39,9 +39,10 @@ PRESS_END_TIMEOUT_S = 4.0
 
 # --- release ---
 MAX_PRESS_DURATION_FOR_GRADUAL_RELEASE_S = 1.5
-"""Time since the gear stopped, s, after which the setpoint is lowered at once instead of in steps:
-by then, the onboard integrator has wound up, and it unwinds slowly by itself. Larger: a press whose
-contact is proven late, because the thrust was not reported, lasts longer than 4 s."""
+"""Time since the vertical speed became constant, s, after which the setpoint of a press is lowered
+at once instead of in steps: by then, the onboard integrator has wound up, and it unwinds slowly by
+itself. Larger: a press whose contact is proven late, because the thrust was not reported, lasts
+longer than 4 s."""
 MIN_RAW_PRESS_TO_HOLDING_THRUST_RATIO = 0.9
 """Fraction of the holding thrust (`complete.hold_ratio` times hover thrust, too little to fly) down
 to which the raw thrust of a press is lowered."""
@@ -111,13 +112,14 @@ def reduce_press_before_weight_transfer(c: Context) -> Action:
     magnet.
 
     Lower the setpoint in steps to `complete.release_drop_m` below the contact until the
-    measurements show that the magnet carries the vehicle. In a press by raw thrust, lower the
-    thrust to just below the holding thrust instead. If the press has lasted longer than
-    `MAX_PRESS_DURATION_FOR_GRADUAL_RELEASE_S`, take all steps at once.
+    measurements show that the magnet carries the vehicle; if the press has lasted longer than
+    `MAX_PRESS_DURATION_FOR_GRADUAL_RELEASE_S`, take all steps at once. In a press by raw thrust,
+    which winds up no integrator, lower the thrust to just below the holding thrust instead.
     """
     complete, perch, state, b = c.planner.complete, c.planner.perch, c.state, c.belief
     step = min(complete.steps, 1 + int(c.time_in_phase_s / complete.release_s * complete.steps))
-    if c.t_s - b.imu.climb_rate_became_steady_at_s > MAX_PRESS_DURATION_FOR_GRADUAL_RELEASE_S:
+    pressed_s = c.t_s - b.imu.climb_rate_became_steady_at_s
+    if perch.mode != "raw" and pressed_s > MAX_PRESS_DURATION_FOR_GRADUAL_RELEASE_S:
         step = complete.steps
     part = step / complete.steps
     if perch.mode == "raw":

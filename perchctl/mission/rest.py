@@ -53,7 +53,7 @@ def find_rest_state(c: Context) -> RestState:
     if _is_held_by_other_object(c):
         return RestState.HELD
     restarted_at_s = b.imu.vehicle_restarted_at_s
-    if b.is_target_position_source or not b.is_position_valid or restarted_at_s > state.entry.t_s:
+    if b.is_target_position_source or not b.is_position_valid or restarted_at_s > -math.inf:
         is_seen = b.target.is_tracked and b.dead_reckoning.last_sighting_at_s >= restarted_at_s
         if is_seen and b.target.is_far_above:
             return RestState.STANDS

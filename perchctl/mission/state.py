@@ -33,15 +33,15 @@ class BatteryOutlook:
 class DescentState:
     """State of a descent.
 
-    For a descent by raw thrust: the last commanded thrust, 0..65535 (0 before the descent), when a
-    thrust that may support the vehicle was last commanded (inf before the first one), the change of
-    the climb rate, positive up, that recent commands cause but no sample shows yet, when the floor
-    was detected (None before), and when a setpoint last gave the firmware a new heading.
+    For a descent by raw thrust: the last commanded thrust, 0..65535 (0 before the descent), since
+    when all commanded thrusts have been too small to fly (inf if the last one was not), the change
+    of the climb rate, positive up, that recent commands cause but no sample shows yet, when the
+    floor was detected (None before), and when a setpoint last gave the firmware a new heading.
     For the firmware's own landing: when its trajectory ends, and how often it was extended.
     """
 
     last_commanded_raw_thrust: float = 0.0
-    supporting_thrust_commanded_at_s: float = math.inf
+    too_weak_to_fly_since_s: float = math.inf
     climb_rate_measured_at_s: float = -math.inf  # time of the newest sample at the last tick
     # climb rate that recent commands cause and no sample shows yet
     climb_rate_change_not_yet_measured_mps: float = 0.0

@@ -50,6 +50,8 @@ def test_a_fault_is_well_formed(fault: Fault) -> None:
             drawn = [key for effect in case.effects for key in effect.keywords]
             assert all(f"{key}=" in text for key in drawn)
             assert ("from the start" in text) == (fault.phases == FROM_THE_START)
+            assert ("the operator ended" in text) == (phase is Phase.LANDING)
+            assert ("the magnet held only" in text) == (phase is Phase.RECOVER)
 
 
 def test_a_flight_without_a_fault_names_none() -> None:

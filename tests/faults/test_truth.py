@@ -84,6 +84,23 @@ def test_a_sample_tells_the_thrust_reserve_of_the_weakest_motor(
     assert sample.thrust_reserve == pytest.approx(reserve, abs=0.002)
 
 
+def test_a_fluctuating_thrust_at_the_weight_does_not_press() -> None:
+    """A sample above 1.02 of the weight is the fluctuation's, not the order's."""
+    noisy = WatchedVehicle(
+        replace(SCENARIO, mass_kg=0.042, thrust_noise=0.2), CAMERA, TargetConfig()
+    )
+    world, scenario, firmware = noisy.world, noisy.scenario, noisy.firmware
+    world.set_pose((0.0, 0.0, scenario.ceiling_z_m - scenario.gear_body_m[2]), hold=True)
+    pressing, lifts = [], []
+    for _ in range(700):
+        firmware.motors = firmware.driver.pwm((55_500,) * 4, world.battery_v)
+        world.step(firmware.motors)
+        pressing.append(true_sample(noisy).pressing)
+        lifts.append(sum(world.powertrain.forces_n) / (0.042 * 9.81))
+    assert max(lifts[300:]) > 1.02
+    assert not any(pressing)
+
+
 def test_a_sample_tells_how_far_the_gear_is_from_the_target(vehicle: WatchedVehicle) -> None:
     x_m, y_m = vehicle.world.magnet.target_xy_m
     vehicle.world.set_pose((x_m + 0.04, y_m, 1.0), velocity_mps=(0.3, -0.4, 9.0))
@@ -181,7 +198,14 @@ def test_a_vehicle_that_the_firmware_releases_from_the_magnet_in_silence(
     it.show(HANGING, silent_s, motors_on=True, uplink=False).show(HOVER, 0.5, uplink=False)
     off_s = pytest.approx(1.0 + silent_s) if released else None
     assert it.facts.released_in_silence_s == off_s
-    it = Recorded().show(HANGING, 1.0, motors_on=True).show(HOVER, 2.0)
+    for it, falls in (
+        (Recorded().show(HANGING, 1.0, motors_on=True), {}),
+        (Recorded().show(HANGING, 2.0, uplink=False), {"uplink": False, "motors_on": False}),
+    ):
+        assert it.show(HOVER, 2.0, **falls).facts.released_in_silence_s is None
+    it = Recorded().show(HANGING, 1.0, motors_on=True)
+    it.planner.active = True  # its own landing, which needs no packets, takes it off the magnet
+    it.show(HANGING, 1.0, motors_on=True, uplink=False).show(HOVER, 0.5, uplink=False)
     assert it.facts.released_in_silence_s is None
 
 

@@ -642,23 +642,24 @@ def test_what_was_in_reach_and_has_not_fallen_since_hangs(
 
 
 @pytest.mark.parametrize("by_target", [True, False])
-@pytest.mark.parametrize(("seen_s", "found"), [(-3.0, RestState.UNKNOWN), (-1.0, RestState.STANDS)])
+@pytest.mark.parametrize("restarted_s", [-2.0, -5.5])
+@pytest.mark.parametrize(("seen_s", "found"), [(-5.8, RestState.UNKNOWN), (-1.0, RestState.STANDS)])
 def test_after_a_restart_only_a_new_sighting_shows_the_floor(
-    by_target: bool, seen_s: float, found: RestState
+    by_target: bool, restarted_s: float, seen_s: float, found: RestState
 ) -> None:
     """Its estimate is at the origin again, so the target on which it hangs seemed far above, and it
     was reported to be on the floor (seed 2612021214)."""
     restarted = ImuMotion(
         t_s=NOW_S,
-        vehicle_restarted_at_s=NOW_S - 2.0,
-        last_gap_that_may_hide_fall_ended_at_s=NOW_S - 2.0,
+        vehicle_restarted_at_s=NOW_S + restarted_s,
+        last_gap_that_may_hide_fall_ended_at_s=NOW_S + restarted_s,
     )
     assert (
         ended(
             NOW_S - 6.0,
             restarted,
             DeadReckoning(
-                last_gap_in_which_magnet_may_attach_ended_at_s=NOW_S - 2.0,
+                last_gap_in_which_magnet_may_attach_ended_at_s=NOW_S + restarted_s,
                 last_sighting_at_s=NOW_S + seen_s,
             ),
             profile=BY_TARGET if by_target else PROFILE,

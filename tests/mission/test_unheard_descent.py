@@ -134,11 +134,13 @@ def come_down(
     *,
     seen: Callable[[float], bool] = lambda _: True,
     proven: bool = True,
+    stands_still: Callable[[float], bool] = lambda _: False,
     **remembered: Any,
 ) -> list[Command]:
     """Let a landing that has not heard the vehicle for a second fly it, by pictures that are late
     and show the target while it is `seen`; its last telemetry had it hovering where it was. The
-    camera is `proven` if pictures and accelerometer have agreed before."""
+    camera is `proven` if pictures and accelerometer have agreed before. While the loop
+    `stands_still`, the vehicle keeps its last command."""
     heard = telemetry(BEGIN_S - 1.1, vehicle.z_m)
     known = {"hover_thrust": HOVER_THRUST} if "hover_thrust_estimate" not in remembered else {}
     state: PlannerState = remembering(
@@ -155,6 +157,10 @@ def come_down(
         t_s = BEGIN_S + TICK_S * i
         past.append((vehicle.x_m, vehicle.z_m))
         x_m, z_m = past[-1 - late]
+        if stands_still(TICK_S * i):
+            commands.append(commands[-1])
+            vehicle.step(commands[-1])
+            continue
         now = seen(TICK_S * i)
         target = target_at(
             t_s,
@@ -206,6 +212,28 @@ def test_a_climb_in_the_pictures_is_braked_and_is_no_floor(
     a vehicle on the floor: it dropped from 0.45 m (seed 2612015017)."""
     vehicle = Falling(0.45, climb_mps, strength)
     come_down(vehicle, 6.0, visual_motion=seen_before(vehicle))
+    assert vehicle.touched_mps is not None
+    assert -0.75 < vehicle.touched_mps < 0.0
+
+
+@pytest.mark.parametrize("begin_s", [0.1, 0.2])
+def test_a_loop_that_stood_still_takes_the_vehicle_for_no_floor(begin_s: float) -> None:
+    """The vehicle kept its last thrust meanwhile, and that was enough to fly."""
+    vehicle = Falling(1.5, 0.3, 1.0)
+    come_down(
+        vehicle,
+        8.0,
+        stands_still=lambda t_s: begin_s <= t_s < begin_s + 0.56,
+        visual_motion=seen_before(vehicle),
+    )
+    assert vehicle.touched_mps is not None
+    assert -0.75 < vehicle.touched_mps < 0.0
+
+
+def test_a_thrust_that_was_too_small_before_the_descent_proves_no_floor() -> None:
+    vehicle = Falling(1.5, 0.0, 1.0)
+    seen = seen_before(vehicle)
+    come_down(vehicle, 8.0, visual_motion=seen, too_weak_to_fly_since_s=BEGIN_S - 3.0)
     assert vehicle.touched_mps is not None
     assert -0.75 < vehicle.touched_mps < 0.0
 
