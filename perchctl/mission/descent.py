@@ -125,6 +125,15 @@ MIN_DEPTH_BELOW_GROUND_TO_EXTEND_LANDING_M = 0.1
 """Estimated depth below the ground beyond which a vehicle that is still flying shows that the
 ground is lower, m. Larger: a trajectory ends before it is extended. Smaller: the error of a height
 without drift extends the landing."""
+MIN_HEIGHT_ABOVE_GROUND_TO_EXTEND_LANDING_M = 0.06
+"""Estimated height above the ground from which a landing is extended if the vehicle is still flying
+just before its end, m: with too little thrust, it may float in its own ground effect, and stopped
+motors would let it drop. Larger: the vehicle drops from there. Smaller: a vehicle that touches down
+at the last moment waits for another trajectory."""
+LATE_ONBOARD_LANDING_EXTENSION_LEAD_S = 0.25
+"""Time before the end of its trajectory at which such a landing is extended, s. Larger: a landing
+that is about to touch down is extended. Smaller: if a command is lost, the trajectory ends
+first."""
 MIN_THRUST_TO_HOVER_RATIO_IF_FLYING = 0.85
 """Thrust, as a fraction of the hover thrust, from which a vehicle that the firmware is landing
 counts as still flying. Once the vehicle is on the floor, and therefore above the end of its
@@ -483,9 +492,10 @@ def make_onboard_landing_command(
 
 def _command_onboard_landing(c: Context) -> Action:
     """Send the command for the firmware's own landing until the telemetry shows that the vehicle is
-    executing it, and again if the estimate shows the vehicle below the ground while it is still
-    flying: in that case, the estimated height has drifted, or the ground is lower here, and the
-    trajectory would end in the air, where the firmware would stop the motors."""
+    executing it. Extend a landing whose trajectory would end in the air, where the firmware would
+    stop the motors: if the vehicle is still flying below the estimated ground, the estimated height
+    has drifted, or the ground is lower here; if it is still above the ground just before the end,
+    it floats in its ground effect with too little thrust to follow."""
     tel, b = c.telemetry, c.belief
     state, away = end_press(c)
     if (
@@ -517,16 +527,20 @@ def _command_onboard_landing(c: Context) -> Action:
         and b.is_imu_fresh
         and tel.has_bit(HL_ACTIVE)
     )
-    flies_below_ground = (
+    still_flies = (
         all(map(math.isfinite, tel.position_m))
-        and b.height_m < -MIN_DEPTH_BELOW_GROUND_TO_EXTEND_LANDING_M
         and tel.thrust >= MIN_THRUST_TO_HOVER_RATIO_IF_FLYING * b.hover_thrust
     )
+    lead_s = -math.inf
+    if b.height_m < -MIN_DEPTH_BELOW_GROUND_TO_EXTEND_LANDING_M:
+        lead_s = ONBOARD_LANDING_EXTENSION_LEAD_S
+    elif b.height_m > MIN_HEIGHT_ABOVE_GROUND_TO_EXTEND_LANDING_M:
+        lead_s = LATE_ONBOARD_LANDING_EXTENSION_LEAD_S
     extension_count = state.descent.onboard_landing_extension_count
     if (
         seen
-        and flies_below_ground
-        and c.t_s >= state.descent.onboard_landing_ends_at_s - ONBOARD_LANDING_EXTENSION_LEAD_S
+        and still_flies
+        and c.t_s >= state.descent.onboard_landing_ends_at_s - lead_s
         and extension_count < MAX_ONBOARD_LANDING_EXTENSIONS
     ):
         # While a landing is in progress, the firmware refuses another one; a setpoint ends its

@@ -319,6 +319,7 @@ def test_a_flight_that_was_refused_or_landed_without_need_perches(
         21011139,  # it sank to the floor at full thrust and went on along it
         21231243,  # it hovered at 98 % of its thrust, and a gap in the radio let it touch the floor
         21231300,  # the ground effect lifted it, and it sank back
+        2612023021,  # it floated at 0.1 m when the trajectory of its landing ended
     ],
 )
 def test_a_vehicle_that_can_hardly_hover_lands_without_a_fall(seed: int, tmp_path: Path) -> None:
