@@ -118,6 +118,15 @@ def test_the_uri_of_the_environment_is_used(monkeypatch: pytest.MonkeyPatch) -> 
     assert "udp://h:1" in run("fly", "--dry-run", "-u", "udp://h:1", "--source", "camera:0").stdout
 
 
+def test_the_plan_warns_about_the_uri_that_is_flown(profile: str) -> None:
+    words = f"fly -p {profile} --source camera:0 --dry-run --json -u radio://0/80/2M/"
+    for address, warns in (("E7", True), ("E7E7E7E7E7", False)):
+        names = [
+            row["name"] for row in json.loads(run(*f"{words}{address}".split()).stdout)["check"]
+        ]
+        assert ("short address" in names) is warns
+
+
 # --- Bad input, before anything is opened ---------------------------------------------------
 
 

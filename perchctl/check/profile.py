@@ -25,7 +25,7 @@ from perchctl.check.row import (
 from perchctl.errors import PerchError, SafetyAbort
 from perchctl.files import check_writable
 from perchctl.flight import FlyOptions
-from perchctl.link import vehicle_uri
+from perchctl.link import check_uri, vehicle_uri
 from perchctl.places import is_shipped_example
 from perchctl.profile import DOUBTFUL, Profile, find_calibration
 from perchctl.target import mm_text, sees_small_marker
@@ -96,8 +96,12 @@ class _Plan:
 
 def _short_address_rows(uri: str) -> list[Row]:
     """Return a row for a radio URI whose address is too short: cflib puts zeros before it."""
+    try:
+        scheme = check_uri(uri)
+    except PerchError:
+        return []  # an invalid URI is refused elsewhere, and identifies no vehicle
     parts = uri.partition("?")[0].split("/")
-    if parts[0] != "radio:" or len(parts) < 6:
+    if scheme != "radio" or len(parts) < 6:
         return []
     whole = vehicle_uri(uri).rpartition("/")[2]
     if not 0 < len(parts[5]) < len(whole):

@@ -340,7 +340,7 @@ def plan_record(options: flights.FlyOptions) -> dict[str, Any]:
     """Return the fully resolved flight plan, without connecting to anything."""
     calibration = profiles.find_calibration(options.profile.camera.calibration)
     mask = options.profile.camera.mask
-    rows = checks.profile_rows(options.profile, source=options.source)
+    rows = checks.profile_rows(options.profile, source=options.source, uri=options.uri)
     compared = checks.comparison_rows(
         options.profile.positioning,
         options.uri,

@@ -91,6 +91,21 @@ def test_a_calibration_that_is_not_there_is_a_fail() -> None:
     assert row_of(lost, "stand-off").verdict is Verdict.SKIPPED
 
 
+def test_only_a_valid_uri_has_a_short_address() -> None:
+    def rows(uri: str) -> list[Row]:
+        by_option = profile_rows(load_profile("sim"), uri=uri)
+        assert by_option == profile_rows(short_profile({"link.uri": uri}, base="sim"))
+        return [row for row in by_option if row.name == "short address"]
+
+    (row,) = rows("radio://0/80/2M/E7")
+    assert (row.verdict, row.found) == (
+        Verdict.WARN,
+        "radio://0/80/2M/E7 means the address 00000000E7",
+    )
+    for uri in ("radio://0/x/2M/E7", "radio://0/80/3M/E7", "radio://0/80/2M/xyz", "radio:/"):
+        assert rows(uri) == []
+
+
 @pytest.mark.parametrize("rpy_deg", [(180, 0, 0), (0, -90, 0), (50, 0, 0)])
 def test_a_camera_that_does_not_look_up_is_a_fail(rpy_deg: tuple[float, ...]) -> None:
     row = row_of(short_profile({"camera.mount.rpy_deg": rpy_deg}, base="sim"), "camera turn")
