@@ -6,6 +6,7 @@ drawn as well, without the order of flight, to show which vehicles are in each o
 
 from __future__ import annotations
 
+import itertools
 import math
 import textwrap
 from collections.abc import Mapping
@@ -60,11 +61,18 @@ def draw_text(fleet: Fleet, groups: tuple[tuple[str, ...], ...] = ()) -> str:
         return row, min(columns - 1, int((place[0] - low[0]) / cell_m))
 
     def write(at: tuple[int, int], text: str) -> None:
-        """Write the text at the nearest place in the row where it covers no other text."""
-        row, wanted = at
-        starts = range(columns - len(text) + 1)
-        free = (s for s in starts if set(cells[row][s : s + len(text)]) <= {" ", INSIDE, OVERLAP})
-        start = min(free, key=lambda s: abs(s - wanted), default=min(wanted, starts[-1]))
+        """Write the text at the nearest place where it neither covers nor touches another text."""
+        (wanted_row, wanted), last = at, columns - len(text)
+
+        def away(place: tuple[int, int]) -> float:
+            return math.hypot((place[0] - wanted_row) * CELL_ASPECT, place[1] - wanted)
+
+        free = (
+            (row, start)
+            for row, start in itertools.product(range(rows), range(last + 1))
+            if set(cells[row][max(0, start - 1) : start + len(text) + 1]) <= {" ", INSIDE, OVERLAP}
+        )
+        row, start = min(free, key=away, default=(wanted_row, min(wanted, last)))
         cells[row][start : start + len(text)] = text
 
     for number, vehicle in enumerate(fleet.vehicles, 1):

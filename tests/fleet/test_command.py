@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import pytest
 
 from perchctl.fleet import draw_svg, draw_text, load_fleet
+from perchctl.fleet.fleet import Fleet
 from tests.fleet.rig import fleet
 from tests.helpers.commands import run
 
@@ -116,13 +117,26 @@ def test_the_map_has_each_home_and_target_where_it_is() -> None:
     assert at["4*"][1] < at["1*"][1] < at["2*"][1], "x is to the right"
 
 
+def labels(planned: Fleet) -> list[str]:
+    """The labels on the map, sorted, as they are read: two that touch are read as another one."""
+    lines = draw_text(planned).splitlines()
+    drawn = lines[: next(n for n, line in enumerate(lines) if "x to the right" in line)]
+    return sorted(re.findall(r"(?<!\d)\d+\*?(?![\d*])", "\n".join(drawn)))
+
+
+def test_no_label_touches_another_one() -> None:
+    """Home 1 beside target 1 would read 11*, the target of vehicle 11."""
+    beside = fleet([((0.06 * n, 0.0), (0.06 * n - 0.03, 0.0)) for n in range(12)])
+    crowd = fleet([((0.0, 0.0), (0.0, 0.0))] * 32)
+    assert labels(beside) == sorted(f"{n}{star}" for n in range(1, 13) for star in ("", "*"))
+    assert labels(crowd) == sorted(f"{n}*" for n in range(1, 33))
+
+
 def test_each_label_of_the_list_is_on_the_map_whole() -> None:
     """Also where a home and a target, or the targets of two vehicles, are side by side."""
     close = fleet([((0.0, 0.0), (-0.03, 0.0)), ((0.1, 0.0), (0.0, 0.0)), ((3.0, 0.0), (3.0, 0.0))])
     lines = draw_text(close).splitlines()
-    drawn = lines[: next(n for n, line in enumerate(lines) if "x to the right" in line)]
-    found = re.findall(r"\d\*?", "\n".join(drawn))
-    assert sorted(found) == ["1", "1*", "2", "2*", "3*"], (
+    assert labels(close) == ["1", "1*", "2", "2*", "3*"], (
         "a home below its own target has one label"
     )
     assert "1 home, 1* target (or both, if they are in the same place)" in lines
