@@ -323,7 +323,7 @@ def _without_order(
     else:
         whys = [f"{p.first} must fly before {p.then} because {p.why}" for p in circle]
     names = sorted((each.first for each in circle), key=list(corridors).index)
-    remedies = ["move a home or target farther away", *_remedies(circle, fleet, corridors)]
+    remedies = ["move a home or target farther away", *_remedies(fleet, corridors)]
     return (
         f"there is no order in which {_and(names)} can fly: {_and(whys)}; a waiting or hanging "
         f"vehicle must be at least {OBSTACLE_M:g} m away from another vehicle's corridor: "
@@ -337,13 +337,11 @@ def _and(parts: Sequence[str]) -> str:
     return f"{', '.join(others)}{comma} and {last}"
 
 
-def _remedies(
-    circle: Sequence[Precedence], fleet: Fleet, corridors: dict[str, Corridor]
-) -> list[str]:
+def _remedies(fleet: Fleet, corridors: dict[str, Corridor]) -> list[str]:
     """Return changes with which the whole fleet can be flown, found by planning it with each."""
     nearest = assign_nearest(fleet)
     by_nearest = "set assign: nearest if the targets are interchangeable"
-    radius_m = max(corridors[each.first].radius_m for each in circle)
+    radius_m = max(corridor.radius_m for corridor in corridors.values())
     by_room = (
         f"use a motion-capture system or Lighthouse (frame: room), with which a corridor radius of "
         f"{WANDER_M + ROOM_ERROR_M:.2f} m is enough instead of {radius_m:.2f} m"

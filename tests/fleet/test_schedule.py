@@ -191,6 +191,18 @@ def test_a_drifting_estimate_is_the_reason_that_is_named() -> None:
     assert "a corridor radius of 0.35 m is enough instead of 1.00 m" in sentence
 
 
+def test_the_largest_radius_is_named_even_if_others_meet_first() -> None:
+    """v0 and v1, which are in room axes, have to swap targets; v2 and v3 need smaller corridors."""
+    ways: list[tuple[Point, Point]] = [((0, 0), (1, 0)), ((1, 0), (0, 0))]
+    near: list[tuple[Point, Point]] = [((10, 0), (10.1, 0)), ((10.8, 0), (10.9, 0))]
+    planned, drifting = fleet(ways + near), deck(ways + near).vehicles[2:]
+    sentence = refusal(replace(planned, vehicles=(*planned.vehicles[:2], *drifting)))
+    assert sentence.startswith("there is no order in which v0 and v1 can fly")
+    wide_m = corridor_radius_m(drifting[0])
+    assert wide_m > WANDER_M + ROOM_ERROR_M
+    assert f"a corridor radius of 0.35 m is enough instead of {wide_m:.2f} m" in sentence
+
+
 def test_a_circle_of_three_is_refused() -> None:
     """Each waits in the way of the next one."""
     ways: list[tuple[Point, Point]] = [((0, 0), (2, 0)), ((2, 0), (2, 2)), ((2, 2), (0, 0.4))]
