@@ -145,6 +145,21 @@ def test_a_target_that_some_pictures_show_in_its_place_is_the_own_one(
     assert (row.verdict, "0.05 m from its expected position" in row.found) == (Verdict.PASS, True)
 
 
+def test_a_target_that_is_once_measured_beyond_the_limit_is_not_looked_for_again(
+    sim: SimProcess, relay: Relay, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even if it would then be within the limit."""
+    seen = iter(
+        Rehearsal(True, target_places=[(1.0, np.array([x_m, 0.0, 2.2]))]) for x_m in (0.31, 0.29)
+    )
+    monkeypatch.setattr(identity, "rehearse", lambda *_: next(seen))
+    row = rows_of(relay.uri, sim)["target"]
+    assert (row.verdict, row.found) == (
+        Verdict.FAIL,
+        "the camera sees a target 0.31 m from the vehicle's own target",
+    )
+
+
 @pytest.mark.parametrize(("covers", "verdict"), [(True, Verdict.PASS), (False, Verdict.FAIL)])
 def test_a_camera_that_another_one_resembles_is_proven_by_a_covered_lens(
     sim: SimProcess, relay: Relay, covers: bool, verdict: Verdict
