@@ -161,10 +161,13 @@ def test_each_help_is_whole_at_80_columns(name: str) -> None:
 
 
 def test_the_help_of_a_main_subcommand_begins_with_its_own_sentence() -> None:
-    for name, begins in (("fleet check", "Plan a fleet's flight"), ("log show", "Show how and")):
+    for name, begins, goes_on in (
+        ("fleet check", "Plan a fleet's flight", "By default (subcommand check), perchctl reads"),
+        ("log show", "Show how and", "All subcommands read the logs of real and simulated"),
+    ):
         done = run(*name.split(), "--help")
         assert done.stdout.splitlines()[2].strip().startswith(begins)
-        assert "By default (subcommand" in done.stdout or name != "fleet check"
+        assert f"\n\n  {goes_on}" in done.stdout
     usage = run("fleet", "check", "--help").stdout.splitlines()[0]
     assert usage.endswith("fleet check [OPTIONS] [FLEET.yaml]")
 
