@@ -4,13 +4,14 @@ one)."""
 from __future__ import annotations
 
 import datetime
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import yaml
 
 _MOST_SHOWN = 60
+_DEEPEST_SHOWN = 4
 
 
 class _Loader(yaml.SafeLoader):
@@ -102,17 +103,39 @@ def value_text(value: Any) -> str:
     return clip_text(_flow_text(value))
 
 
-def _flow_text(value: Any) -> str:
+def _flow_text(value: Any, depth: int = 0) -> str:
+    """Return the value as YAML on one line, in full only as far as `clip_text` shows it: by its
+    aliases, a short file can contain a list that is very long, or that contains itself."""
     match value:
         case None:
             return "nothing"
         case bool():
             return str(value).lower()
+        case int() if value.bit_length() > 4 * _MOST_SHOWN:
+            return hex(value)  # Python refuses to write out very long decimal numbers
+        case list() | tuple() | dict() if depth == _DEEPEST_SHOWN:
+            return "..."
         case list() | tuple():
-            return f"[{', '.join(map(_flow_text, value))}]"
+            return f"[{_joined(_flow_text(each, depth + 1) for each in value)}]"
         case dict():
-            pairs = (f"{name}: {_flow_text(each)}" for name, each in value.items())
-            return f"{{{', '.join(pairs)}}}"
+            pairs = (
+                f"{name if isinstance(name, str) else _flow_text(name, depth + 1)}: "
+                f"{_flow_text(each, depth + 1)}"
+                for name, each in value.items()
+            )
+            return f"{{{_joined(pairs)}}}"
         case datetime.date():
             return str(value)
     return repr(value)
+
+
+def _joined(texts: Iterable[str]) -> str:
+    """Return the texts with commas between them, as many as a message shows."""
+    shown, length = list[str](), 0
+    for text in texts:
+        if length > _MOST_SHOWN:
+            shown.append("...")
+            break
+        shown.append(text)
+        length += len(text) + 2
+    return ", ".join(shown)

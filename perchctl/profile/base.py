@@ -59,9 +59,12 @@ def _takes_numbers(kind: Any) -> bool:
     return kind in (int, float) or any(map(_takes_numbers, get_args(kind)))
 
 
-def _holds_switch(value: Any) -> bool:
+def _holds_switch(value: Any, levels: int = 2) -> bool:
+    """`levels`: how many lists or mappings deep to look; no key has numbers any deeper. By its
+    aliases, a YAML value can contain itself."""
     if isinstance(value, (dict, list)):
-        return any(map(_holds_switch, value.values() if isinstance(value, dict) else value))
+        inner = value.values() if isinstance(value, dict) else value
+        return levels > 0 and any(_holds_switch(each, levels - 1) for each in inner)
     return isinstance(value, bool)
 
 

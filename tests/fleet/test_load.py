@@ -173,6 +173,12 @@ REFUSED = [
     ),
     (two(top="order:"), "order: found nothing; allowed are one-at-a-time, together, or a number"),
     (two(top="assign: yes"), "assign: must be fixed or nearest, found true"),
+    (two(top="order: &a {b: *a}"), "order: found {b: {b: {b: {b: ...}}}}; allowed are one-at-a"),
+    (two(top="name: &a [*a]"), "name: must be text, found [[[[...]]]]"),
+    (
+        two().replace("[3, 0]", "&a [*a, 1]"),
+        "vehicle east: home_m.0: must be a number, found [[[[..., 1], 1], 1], 1]",
+    ),
     (two(top="on_failure:"), "on_failure: must be continue or land-all, found nothing"),
     ("vehicles: []", "vehicles: must have at least 1 entry, found []"),
     ("vehicles: [a]", "vehicles, number 1: must have keys and values, found 'a'; add some, or"),

@@ -16,6 +16,7 @@ import perchctl
 from perchctl.calibration import load_calibration
 from perchctl.errors import InvalidValue, Note, NotFound, ProfileNote
 from perchctl.places import file_names
+from perchctl.plain_yaml import value_text
 from perchctl.profile import (
     PositioningConfig,
     Profile,
@@ -120,6 +121,11 @@ def _refusal(tmp_path: Path, text: str) -> str:
         ("kalman: {noise: null}", ["kalman.noise: must be fixed or measured, found nothing"]),
         ("camera: {mirrored: 7}", ["camera.mirrored: must be true or false, found 7"]),
         ("camera: {source: 7}", ["camera.source: must be text, found 7: put it in quotes"]),
+        ("camera: {source: {no: [on]}}", ["must be text, found {false: [true]}"]),
+        ("kalman: {alpha: 0x1" + 4000 * "0" + "}", ["must be a number, found 0x1000"]),
+        ("camera: &a [*a]", ["camera: must have keys and values, found [[[[...]]]]; add some"]),
+        ("name: &a {b: [*a]}", ["name: must be text, found {b: [{b: [...]}]}"]),
+        ("link: {parameters: &a {b: *a}}", ["link.parameters.b: must be a number, found {b: {b:"]),
         ("camera: {format: 7x}", ["format: found '7x'; allowed here: pixel format to request"]),
         ("date: 5", ["date: must be a date, as in 2026-01-31, found 5"]),
         ("safety: {fence_radius_m: 60}", ["fence_radius_m: must be at most 50, found 60 (the"]),
@@ -145,6 +151,21 @@ def test_faults_are_one_sentence(tmp_path: Path, text: str, expected: list[str])
     message = _refusal(tmp_path, text)
     for word in expected:
         assert word in message
+
+
+def test_a_value_is_written_out_only_as_far_as_a_message_shows_it(tmp_path: Path) -> None:
+    """By its aliases, a file of a few lines can have a value of many megabytes."""
+
+    class NeverShown:
+        def __repr__(self) -> str:
+            pytest.fail("this is far beyond the end of the message")
+
+    values = [*[1] * 60, NeverShown()], {**dict.fromkeys(range(60)), 60: NeverShown()}
+    for value in values:
+        text = value_text(value)
+        assert (len(text), text[-3:]) == (60, "...")
+    message = _refusal(tmp_path, "name: [&a [[7]], &b [*a], [*b, *b]]")
+    assert "name: must be text, found [[[7]], [[[7]]], [[[...]], [[...]]]]" in message
 
 
 def test_a_latency_is_a_time_or_measured(tmp_path: Path) -> None:
