@@ -207,6 +207,15 @@ def key_and_reason(error: ValidationError, model: Any = Profile) -> tuple[str, s
         if model is Profile and not loc[:-1]:
             keys = ["extends", *keys]
         return key, f"this key is unknown; {nearest_names(str(loc[-1]), keys)}"
+    if kind == "invalid_key" or loc[-1:] == ("[key]",):
+        *places, _ = loc[:-1] if loc[-1] == "[key]" else loc
+        is_entry = bool(places) and isinstance(places[-1], int)
+        number = f", number {int(places.pop()) + 1}" if is_entry else ""
+        section = clip_text(".".join(str(part) for part in places)) + number
+        note = " (YAML reads yes, no, on and off as true or false)"
+        why = note if isinstance(first["input"], bool) else ""
+        shown = value_text(first["input"])
+        return section, f"found the key {shown}, but keys must be text{why}: put it in quotes"
     if kind == "value_error":
         return key, clip_text(str(context["error"]), _MOST_OF_A_FAULT)
     if kind == "missing" and in_list:
