@@ -253,9 +253,11 @@ def _check(path: Path, where: str, vehicle: FleetVehicle, own: _Vehicle, common:
             if only == "room"
             else "axes with their origin at its position before take-off"
         )
+        place = at("frame")
+        whose = "its" if place == where else f"{vehicle.name}'s"
         raise InvalidValue(
-            f"{where}: frame: is {vehicle.frame}, but with positioning by {positioning.label} its "
-            f"estimate uses {axes}: write {only}, or leave it out"
+            f"{place}: frame: is {vehicle.frame}, but with positioning by {positioning.label} "
+            f"{whose} estimate uses {axes}: write {only}, or leave it out"
         )
     try:
         key = "uri"
@@ -268,8 +270,8 @@ def _check(path: Path, where: str, vehicle: FleetVehicle, own: _Vehicle, common:
         raise type(error)(f"{at(key)}: {error}") from None
     if not vehicle.simulated and (source.scheme == "sim" or not source.live):
         raise InvalidValue(
-            f"{where}: camera source {source} is not a live camera, but {uri} is a real vehicle: "
-            f"name its camera, as in source: camera:0"
+            f"{at('source')}: camera source {source} is not a live camera, but {uri} is a real "
+            f"vehicle: name its camera, as in source: camera:0"
         )
 
 

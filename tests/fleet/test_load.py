@@ -262,6 +262,18 @@ REFUSED = [
         "vehicle north: frame: is room, but with positioning by the view of the target its",
     ),
     (
+        two(defaults=", frame: room, positioning: target"),
+        "defaults: frame: is room, but with positioning by the view of the target north's estimate",
+    ),
+    (
+        two(", frame: home", ", frame: home", defaults=", frame: room, positioning: mocap"),
+        "vehicle north: frame: is home, but with positioning by motion capture at vicon its",
+    ),
+    (
+        two(second=", uri: radio://0/80/2M/E7E7E7E701", defaults=", source: 'sim:'"),
+        "defaults: camera source sim: is not a live camera, but radio://0/80/2M/E7E7E7E701 is a",
+    ),
+    (
         two(", frame: home", defaults=", positioning: mocap"),
         "vehicle north: frame: is home, but with positioning by motion capture at vicon its",
     ),
