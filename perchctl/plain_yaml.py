@@ -12,6 +12,9 @@ import yaml
 
 _MOST_SHOWN = 60
 _DEEPEST_SHOWN = 4
+_MOST_DECIMAL_BITS = 14_000
+"""Size above which an integer is shown in hexadecimal digits. Larger: Python refuses to write more
+than 4300 decimal digits."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -111,8 +114,8 @@ def _flow_text(value: Any, depth: int = 0) -> str:
             return "nothing"
         case bool():
             return str(value).lower()
-        case int() if value.bit_length() > 4 * _MOST_SHOWN:
-            return hex(value)  # Python refuses to write out very long decimal numbers
+        case int() if value.bit_length() > _MOST_DECIMAL_BITS:
+            return hex(value)
         case list() | tuple() | dict() if depth == _DEEPEST_SHOWN:
             return "..."
         case list() | tuple():
