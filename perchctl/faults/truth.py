@@ -226,10 +226,8 @@ class FactsRecorder(Facts):
     def _note_power(self, s: Sample) -> None:
         """Record when four times the thrust of the weakest motor first fails to lift the weight,
         and when the battery's voltage under load is first too low."""
-        vehicle, world = self._vehicle, self._vehicle.world
-        lift_n = world.powertrain.max_balanced_thrust_n()
-        weight_n = vehicle.scenario.mass_kg * GRAVITY_MPS2
-        if self.weak_s is None and lift_n < LEAST_LIFT * weight_n:
+        world = self._vehicle.world
+        if self.weak_s is None and 1.0 + s.thrust_reserve < LEAST_LIFT:
             self.weak_s = s.t_s
         if self.battery_low_s is None and world.battery_v < self._min_load_v:
             self.battery_low_s, self.battery_low_m = s.t_s, s.height_m
