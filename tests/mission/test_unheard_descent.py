@@ -253,6 +253,22 @@ def test_with_an_unsure_hover_thrust_setpoints_come_first_also_with_pictures(
     assert waits_s == pytest.approx(1.5 if sigma_fraction > 0.05 else 0.0, abs=0.05)
 
 
+@pytest.mark.parametrize("known_wrong", ["is_position_diverged", "is_heading_lost"])
+def test_setpoints_do_not_come_first_on_an_estimate_that_is_known_to_be_wrong(
+    known_wrong: str,
+) -> None:
+    vehicle = Falling(1.0, 0.0, 1.0)
+    unsure = HoverThrust(HOVER_THRUST, 0.12)
+    orders = come_down(
+        vehicle,
+        1.0,
+        visual_motion=seen_before(vehicle),
+        hover_thrust_estimate=unsure,
+        **{known_wrong: True},
+    )
+    assert not any(isinstance(order, PositionSetpoint) for order in orders)
+
+
 @pytest.mark.parametrize("gap_s", [(8.0, 8.4), (4.5, 5.5), (5.0, 6.5), (1.0, 1.4), (1.0, 14.0)])
 def test_pictures_that_are_lost_never_let_it_climb(gap_s: tuple[float, float]) -> None:
     """In the air and on the floor, for a few pictures or for good (seeds 20511149, 20511165)."""
