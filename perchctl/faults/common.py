@@ -10,13 +10,16 @@ from typing import Literal
 import numpy as np
 
 from perchctl.faults import effects as e
-from perchctl.faults.catalogue import Case, DrawInputs, Fault, duration_s
+from perchctl.faults.catalogue import Case, DrawInputs, Fault, duration_s, uniform
 from perchctl.mission import Phase
 from perchctl.sim import Scenario
 
 STALL_S = 2.0
 """Duration of the computer's stall, s. Larger: the firmware cuts the motors, which no program can
 prevent."""
+PARENT_NOTICED_S = 1.0
+"""Longest time until a vehicle notices that the parent is gone, s: at once if the parent was
+killed, after 1 s if it hangs. Larger: vehicles fly on for longer than they do in a real fleet."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,11 @@ def _dead_dongle(source: DrawInputs) -> e.Effect:
     return partial(e.radio_loss, up=True, down="all", for_s=e.FOR_EVER)
 
 
+def _dead_parent(source: DrawInputs) -> e.Effect:
+    noticed_s = uniform(0.0, PARENT_NOTICED_S)(source)
+    return partial(e.parent_gone, noticed_s=noticed_s, for_s=e.FOR_EVER)
+
+
 COMMON_CAUSES: tuple[CommonCause, ...] = (
     CommonCause(
         Fault("capture-silent", "the motion-capture system sends nothing", _capture("silent"))
@@ -74,4 +82,5 @@ COMMON_CAUSES: tuple[CommonCause, ...] = (
         Fault("dongle-dies", "the links of all vehicles on one dongle are silent", _dead_dongle),
         "dongle",
     ),
+    CommonCause(Fault("parent-dies", "the parent process is killed or hangs", _dead_parent)),
 )

@@ -199,6 +199,12 @@ def operator(
         rig.call_at(t_s + press_s, rig.hang_up if hang_up else rig.press)
 
 
+def parent_gone(rig: FaultRig, t_s: float, noticed_s: float, for_s: float) -> None:
+    """Take away the fleet's parent process for `for_s`, which must be permanent; the vehicle's
+    process notices it after `noticed_s` and lands (`perchctl.fleet.parent_watch`)."""
+    rig.call_at(t_s + noticed_s, rig.hang_up)
+
+
 def killed(rig: FaultRig, t_s: float) -> None:
     """Kill the program the next time its loop waits."""
     rig.clock.pending = rig.clock.kill

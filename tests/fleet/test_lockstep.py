@@ -19,7 +19,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed, InvalidValue, UsageError
-from perchctl.faults import FAULTS, HEALTHY, Case, FaultResult, FaultyFlight
+from perchctl.faults import COMMON_CAUSES, FAULTS, HEALTHY, Case, FaultResult, FaultyFlight
 from perchctl.faults.effects import FOR_EVER, external_positions
 from perchctl.fleet import (
     FleetPlan,
@@ -490,7 +490,8 @@ def test_a_vehicle_that_is_turned_is_another_plan() -> None:
 
 
 def test_faults_are_chosen_by_name() -> None:
-    assert len(select_fleet_faults("all")) == len(FAULTS) + 4
+    names = [each.name for each in (*FAULTS, *(cause.fault for cause in COMMON_CAUSES))]
+    assert sorted(select_fleet_faults("all")) == sorted(set(names))
     assert select_fleet_faults("kick, stall") == ("kick", "stall")
     assert HEALTHY.fault.name not in select_fleet_faults("all")
     with pytest.raises(InvalidValue, match=r"'dongle-dis' is unknown; did you mean dongle-dies\? "):
@@ -590,6 +591,7 @@ def test_a_fault_in_one_vehicle_changes_nothing_for_its_neighbours(fault: str) -
         ("bodies-swap", ["landed", "landed", "refused"]),  # nobody knows the second one's place
         ("stall", ["landed", "landed", "perched"]),
         ("dongle-dies", ["aborted", "aborted", "refused"]),  # unseen, as the firmware cuts them
+        ("parent-dies", ["landed", "landed", "refused"]),
     ],
 )
 def test_no_common_cause_makes_vehicles_meet(cause: str, ends: list[str]) -> None:
