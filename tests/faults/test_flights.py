@@ -125,6 +125,7 @@ def test_nothing_goes_wrong(name: str, phase: Phase, by: str) -> None:
         ("target_only", 2612011472),  # a descent on a hover thrust that was 15 % too small
         ("target_only", 2612021064),  # the notify after the last stop was lost: locked
         ("target_only", 2612021214),  # restarted on the magnet, and reported to be on the floor
+        ("target_only", 2612011437),  # without the state block: sank at 0.94 m/s in full view
     ],
 )
 def test_nothing_goes_wrong_any_more_in_a_seed_of_a_campaign(name: str, seed: int) -> None:

@@ -555,6 +555,18 @@ def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
     assert (command.thrust > 0.97 * HOVER_THRUST) is (later_s > 0.0)
 
 
+@pytest.mark.parametrize("behind_s", [0.0, 0.05, 0.5, 5.0])
+def test_without_the_state_block_pictures_measure_the_climb_rate(behind_s: float) -> None:
+    """Seed 2612011437: the accelerometer alone was wrong by 0.25 m/s after three seconds."""
+    dead_reckoning = DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.03), velocity_mps=(0.0, 0.0, -0.7))
+    c = context("imu", dead_reckoning=dead_reckoning, tel={"behind_s": behind_s})
+    motion = VisualInertialMotion(NOW_S - 0.01, (0.0, 0.0), (0.0, 0.0), -0.95)
+    obs = replace(c.obs, visual_inertial_motion=motion, imu=replace(c.obs.imu, t_s=NOW_S))
+    climb_mps = observing(c.state, obs, c.profile).belief.climb_mps
+    is_old = behind_s > c.profile.safety.proof_age_s
+    assert climb_mps == pytest.approx(-0.95 if is_old else -0.7, abs=0.05)
+
+
 @pytest.mark.parametrize("diverged", [False, True])
 def test_positions_that_have_diverged_place_the_floor_anywhere(diverged: bool) -> None:
     """Seed 20591183: late motion capture placed the floor 0.9 m too low, and the vehicle struck it
