@@ -30,8 +30,11 @@ _ROWS_PER_COMBING_GROUP = 8
 # A pixel counts if its difference exceeds this multiple of the mean difference within the fields.
 _MIN_ROW_DIFFERENCE_TO_MEAN_RATIO = 5.0
 _MIN_ROW_DIFFERENCE_GREY = 8.0
-_NOISE_FLOOR_GREY2 = 0.25  # energy per pixel of strong differences that noise alone may cause
+# Energy per pixel of strong row differences that noise alone may cause.
+_NOISE_FLOOR_GREY2 = 0.25
 _COMBING_CHECK_INTERVAL_FRAMES = 3
+# The position error of a horizontal edge in an interpolated field is the first value times exp(-k
+# s^2), where s is the standard deviation of the blur, px, and k the second value.
 _ALIASING_SIGMA_PX, _ALIASING_DECAY_PER_PX2 = 0.8, 2.45
 # cubic interpolation at the midpoint
 _INTERPOLATION_TAPS = np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0
@@ -41,7 +44,7 @@ _PERIOD_RANGE_ROUNDED_TO_NTSC_OR_PAL_S = (0.029, 0.045)
 _VALID_FRAME_PERIOD_RANGE_S = (0.004, 0.1)
 _MAX_STORED_FRAME_PERIODS = 25
 _MIN_LOST_FRAME_TO_MEDIAN_PERIOD_RATIO = 1.8
-# After a longer gap, the previous frame says nothing about the field order.
+# After a longer gap, s, the previous frame says nothing about the field order.
 _MAX_FRAME_GAP_S = 0.25
 # The votes decide the field order if their sum exceeds this value. Each vote is at most 1, so the
 # decision takes at least two frames.

@@ -43,12 +43,12 @@ class MergedTarget:
     state estimate.
 
     Attributes:
-        track_frame_xyz_yaw: position and yaw of the target (4,).
+        track_frame_xyz_yaw: position and yaw of the target (4,), m and rad.
         track_frame_velocity_mps: velocity of the target (3,).
         track_frame_position_cov_m2, yaw_var_rad2: covariance (3, 3) of the position, and variance
-            of the yaw; constant errors are not included.
+            of the yaw; the biases are not included.
         track_frame_shift_per_bias_sigma_m: change (3, 4) of the position for one standard deviation
-            of each constant error, one column per error (see `TrackMeasurement`).
+            of each bias, in columns: the vehicle's roll and pitch, the print's size and curl.
         unseen_frames: number of frames since the last measurement.
         stage: markers measured in the newest frame.
     """
@@ -72,8 +72,9 @@ def estimate_marker_poses(
 ) -> MarkerPoses:
     """Estimate the poses of the markers detected in one frame, and assign them to the tracks that
     they update: a single track ``joint``, or one track for each marker, depending on
-    `merge.method`. If the two markers contradict each other, only the more certain pose updates a
-    track.
+    `config.method`. If the two markers contradict each other, only the more certain pose updates a
+    track. If `config.stages` is ``range`` instead of ``seen``, the distance to the target's plane
+    decides which of the two markers are used.
 
     `attitude` is the vehicle's attitude at the time of the frame (None if unknown). `start_pose` is
     the last pose of the target in the camera frame, corrected for the vehicle's motion since then
@@ -200,8 +201,9 @@ def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[De
     (`Detections.flow_pxps`) times the delay of its row relative to the middle row. Markers without
     a known image velocity stay unchanged.
 
-    If the readout time `setup.readout_s` is None, the corners are not moved, and
-    `corner_shift_per_readout_sigma_px` is their possible shift for a typical readout time.
+    If the readout time `setup.readout_s` is None (unknown), the corners are not moved, and
+    `corner_shift_per_readout_sigma_px` is their possible shift for a readout time of 12 ms
+    (`READOUT_TIME_SIGMA_IF_UNKNOWN_S`). If it is 0, the detections are returned unchanged.
     Otherwise the corners are moved, and `corner_shift_per_readout_sigma_px`, `sigma_px` and
     `cov_px2` include the error of this correction.
     """
@@ -241,7 +243,8 @@ def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[De
 
 
 def classify_visible_markers(is_large_detected: bool, is_small_detected: bool) -> VisibleMarkers:
-    """Return which markers a frame shows, which is the stage in the paper (section II-A.2)."""
+    """Return which of the two markers were detected as one `VisibleMarkers` value, which is the
+    stage in the paper (section II-A.2)."""
     if is_large_detected:
         return VisibleMarkers.BOTH if is_small_detected else VisibleMarkers.LARGE
     return VisibleMarkers.SMALL if is_small_detected else VisibleMarkers.NONE
@@ -283,6 +286,7 @@ def are_marker_positions_inconsistent(
 
 
 def choose_more_certain_pose(large: MarkerPose, small: MarkerPose) -> MarkerPose:
-    """Return the pose whose position has the smaller standard deviation (norm of `sigma_m`)."""
+    """Return the pose whose position has the smaller standard deviation (norm of `sigma_m`), or the
+    large marker's if they are equal."""
     spread_large, spread_small = (float(np.linalg.norm(p.sigma_m)) for p in (large, small))
     return small if spread_small < spread_large else large

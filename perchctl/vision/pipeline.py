@@ -87,8 +87,9 @@ StepFunction = Callable[
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """The pipeline's parameters, created by `make_pipeline`. If `custom_step` is set, it replaces
-    `step`."""
+    """The constant parameters of all steps of the vision pipeline, created by `make_pipeline` from
+    a profile and a camera. If `custom_detector` is set, it replaces the detection of markers. If
+    `custom_step` is set, `perchctl.perception` calls it instead of `step`."""
 
     detector_setup: DetectorSetup
     pose_setup: PoseSetup

@@ -113,8 +113,9 @@ _XYZ_YAW_TO_YAW_XYZ_INDICES = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
 def target_level_to_world(
     e_m: Array, e_yaw_rad: float, attitude: VehicleState, setup: PoseSetup
 ) -> tuple[Array, float]:
-    """Convert a target's position (3,), m, and heading, rad, which are relative to the gear in the
-    level frame, to the world frame of the state estimate."""
+    """Convert a target's position `e_m` (3,), m, and heading `e_yaw_rad`, which are relative to the
+    gear in the level frame, to the world frame of the state estimate. `attitude` is the vehicle's
+    attitude and position in this frame. Returns the position, m, and the heading, rad."""
     body_to_target_m = e_m + attitude.R_level_body.dot(setup.gear_body_m)
     position_m = np.asarray(attitude.position_m) + attitude.R_world_level.dot(body_to_target_m)
     return position_m, wrap_rad(e_yaw_rad + attitude.yaw_rad)
@@ -127,8 +128,9 @@ def target_world_to_level(
     setup: PoseSetup,
 ) -> tuple[Array, float]:
     """Convert a target's position (3,), m, and heading, rad, from the world frame of the state
-    estimate to the level frame, relative to the gear. This is the inverse of
-    `target_level_to_world`."""
+    estimate to the level frame, relative to the gear. `attitude` is the vehicle's attitude and
+    position in the world frame. Returns the position, m, and the heading, rad. This is the inverse
+    of `target_level_to_world`."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     body_to_target_m = (target_position_world_m - np.asarray(attitude.position_m)).dot(
         attitude.R_world_level
@@ -145,10 +147,12 @@ def make_track_measurement(
 ) -> TrackMeasurement:
     """Convert a pose to a filter measurement of (yaw, x, y, z), rad and m: in the world frame of
     the state estimate (if `is_in_world_frame`), or relative to the gear in the level frame.
+    `attitude` is the vehicle's state at the time of the pose; it is required for the world frame
+    and otherwise None if unknown.
 
-    Its covariance R does not include the errors that are the same in every frame. The shifts due to
-    these errors, the biases of the vehicle's roll and pitch and of the print, are returned
-    separately. R is None, so that the R of the filter setup applies, if the pose has no finite
+    The measurement's covariance R does not include the errors that are the same in every frame: the
+    biases of the vehicle's roll and pitch and of the print. The shifts due to these biases are a
+    separate field. R is None, so that the R of the filter setup applies, if the pose has no finite
     covariance or the filter uses fixed noise.
     """
     z, lever_m = np.empty(4), pose.e_m  # an error of the vehicle's tilt rotates this lever arm

@@ -86,7 +86,8 @@ def update_tracks(
 ) -> TrackedFrame:
     """Update the tracks with those poses of one frame that the gate accepts. The gate judges the
     frame's most certain pose (`judge_pose`); if it rejects this pose, the tracks are only predicted
-    to `t_s`.
+    to `t_s`, the time of the frame. `attitude` is the vehicle's state at this time; None if
+    unknown.
 
     If the gate restarts the tracks, or if they change between the world frame (`is_in_world_frame`)
     and the level frame, they start over. A pose that does not continue a track is also rejected if
@@ -202,7 +203,9 @@ _UNMODELLED_ACROSS, _UNMODELLED_ALONG = 0.015, 0.02
 _POSITION_SELECTION_MATRIX: Array = np.diag([0.0, 1.0, 1.0, 1.0])
 # The message about a rival mentions the rival's rotation if it is larger than this angle.
 _MIN_RIVAL_ROTATION_TO_REPORT_RAD = math.radians(15.0)
-# Limits of a hovering vehicle's motion relative to the target during a jump of the estimate.
+# A jump of the state estimate is only looked for if the target was seen at most this long ago.
+# Since then, a hovering vehicle has moved relative to the target with these standard deviations of
+# speed and rotation rate.
 _MAX_CALM_DURATION_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
 # A jump of the state estimate, or a wrong last pose, is accepted as an explanation if it reduces
 # the squared innovation to less than this fraction of its value.
@@ -211,8 +214,10 @@ _MAX_COST_RATIO_TO_ALTERNATIVE = 0.25
 
 @dataclass(frozen=True, eq=False)
 class FramePose:
-    """A frame's pose with its filter measurement. `has_both_markers` is True if both markers
-    contributed, `is_locked_target_in_view` if the expected position of the tracked target is in the
+    """A frame's pose with its filter measurement, which is in the world frame of the state estimate
+    if `is_in_world_frame` is True, otherwise relative to the gear in the level frame.
+    `has_both_markers` is True if the frame shows both markers and they do not contradict each
+    other, `is_locked_target_in_view` if the expected position of the tracked target is in the
     image, and `is_attitude_unknown` if the camera is used without a vehicle."""
 
     t_s: float
@@ -226,11 +231,12 @@ class FramePose:
 
 @dataclass(frozen=True, eq=False)
 class GateVerdict:
-    """The gate's decision on a pose: whether it is accepted as a pose of the target, whether the
-    tracks restart at this pose, and whether they restart for the locked target
-    (`restarts_at_locked_target`) or for the rival.
+    """The gate's decision on a pose: whether it is accepted as a pose of the target, and whether
+    the tracks restart at this pose (`restarts_track`). At a restart, `restarts_at_locked_target` is
+    True if the pose still belongs to the locked target, and False if the lock changes to the rival.
 
-    `rival` is the rival track after this frame; `reason` explains a rejection or a restart.
+    `rival` is the rival track after this frame, None if there is none; `reason` explains a
+    rejection or a restart, and is otherwise empty.
     """
 
     is_accepted: bool
@@ -249,13 +255,16 @@ def judge_pose(
 ) -> GateVerdict:
     """Decide whether a frame's pose belongs to the tracked target (`lock`), to a competing
     target-like pattern (`rival`), or to neither, in which case it starts a new rival. Lock and
-    rival are None if there is none. Without a lock, every pose is accepted.
+    rival are None if there is none. Every pose is accepted if there is no lock, or if the lock is
+    in another frame (level or world) than the pose. A pose that is not newer than the lock is
+    rejected.
 
-    A pose belongs to a track if its squared Mahalanobis distance from the track's prediction is at
-    most `_MAX_ACCEPTED_INNOVATION_CHI2`, and to the likelier of two such tracks. A pose that fits
-    neither track is still accepted, and the track restarts, if the state estimate has jumped or the
-    previous pose was wrong. A rival's pose is accepted if the evidence for the rival is strong
-    enough to replace the target (`_is_rival_accepted`).
+    A pose belongs to a track if its squared Mahalanobis distance from the track's prediction, with
+    four degrees of freedom, is at most 25 (`_MAX_ACCEPTED_INNOVATION_CHI2`), and to the likelier of
+    two such tracks. A pose that fits neither track is still accepted, and the track restarts, if
+    the state estimate has jumped or the previous pose was wrong. A rival's pose is accepted, and
+    the track restarts at the rival, if the evidence for the rival is strong enough to replace the
+    target (`_is_rival_accepted`).
     """
     lock, rival = drop_expired_lock_and_rival(lock, rival, frame_pose.t_s)
     if rival is not None and rival.is_in_world_frame != frame_pose.is_in_world_frame:
@@ -309,8 +318,9 @@ def drop_expired_lock_and_rival(
     lock: TargetLock | None, rival: RivalTrack | None, t_s: float
 ) -> tuple[TargetLock | None, RivalTrack | None]:
     """Return the lock and the rival, each replaced by None if it has expired at `t_s`. A rival, or
-    a lock in the level frame without a rival, expires if it was not seen for `MAX_TRACK_GAP_S`. Any
-    other lock expires after `LOCK_TIMEOUT_S`."""
+    a lock in the level frame without a rival, expires if it was not seen for `MAX_TRACK_GAP_S` (1
+    s). Any other lock expires after `LOCK_TIMEOUT_S` (10 s). Without a lock, the rival is dropped
+    too, and both are dropped if the clock was set back by more than `MAX_TRACK_GAP_S`."""
     if rival is not None and not 0.0 <= t_s - rival.track.t_s <= MAX_TRACK_GAP_S:
         rival = None
     if lock is None:
@@ -331,9 +341,10 @@ def predict_rival_state(
     t_s: float,
     filter_setup: FilterSetup,
 ) -> Array | None:
-    """Return the rival's state (8,) at `t_s` if the rival was seen more recently than the locked
-    target. Return None otherwise, or if lock and rival are not both in the frame of the tracks: the
-    world frame (if `is_in_world_frame`) or the level frame.
+    """Return the rival's state (8,), predicted to `t_s`, if the rival was seen more recently than
+    the locked target: yaw, yaw rate, then position and velocity of x, y, z, in SI units. Return
+    None otherwise, or if lock and rival are not both in the frame of the tracks: the world frame
+    (if `is_in_world_frame`) or the level frame.
 
     Until one of the two is confirmed, the target may be at either position, so the estimate must
     cover both.
@@ -432,9 +443,9 @@ def _compute_innovation(
 def _is_clearly_consistent(
     track: MarkerTrack, frame_pose: FramePose, filter_setup: FilterSetup
 ) -> bool:
-    """True if the unmodelled errors of lens, print and latency alone explain the difference between
-    the pose and the track's prediction, as in most frames. This fast check then makes the full one
-    unnecessary."""
+    """True if the difference between the pose and the track's prediction is so small that the
+    unmodelled errors of lens, print and latency alone explain it, as in most frames. This fast
+    check, without any covariance, then makes the full one unnecessary."""
     wanted = predict_track(track, frame_pose.t_s, filter_setup)
     residual = frame_pose.measurement.z - wanted.x[MEASURED]
     residual[0] = wrap_rad(float(residual[0]))
@@ -447,8 +458,9 @@ def _range_m(frame_pose: FramePose) -> float:
 
 
 def _unmodelled_yaw_xyz_sigma(range_m: float) -> Array:
-    """Return the standard deviations of (yaw, x, y, z), rad and m, of unmodelled errors
-    (calibration, print, latency) at the range `range_m`."""
+    """Return the standard deviations (4,) of (yaw, x, y, z), rad and m, due to errors that no
+    covariance includes (calibration, print, latency). The values of x, y and z grow linearly with
+    `range_m`, the distance from the camera to the target."""
     sideways_m, along_m = (
         _MIN_UNMODELLED_M + _UNMODELLED_ACROSS * range_m,
         _MIN_UNMODELLED_M + _UNMODELLED_ALONG * range_m,
@@ -459,10 +471,12 @@ def _unmodelled_yaw_xyz_sigma(range_m: float) -> Array:
 def _matches_last_view(
     lock: TargetLock, frame_pose: FramePose, world_innovation_yaw_xyz: Array
 ) -> bool:
-    """True if the state estimate has jumped: the target is where the vehicle last saw it, but not
-    where the world frame predicts it. The pose relative to the gear has then changed much less than
+    """True if the state estimate has jumped: relative to the gear, the target is where the vehicle
+    last saw it, but in the world frame, it is not where its track predicts it. The change of the
+    pose relative to the gear is then small enough for a hovering vehicle and much smaller than
     `world_innovation_yaw_xyz` (4,), which is measured minus predicted (yaw, x, y, z) in the world,
-    rad and m."""
+    rad and m. False in the level frame, and if the target was last seen more than
+    `_MAX_CALM_DURATION_S` ago."""
     dt_s = frame_pose.t_s - lock.track.t_s
     if not frame_pose.is_in_world_frame or dt_s > _MAX_CALM_DURATION_S:
         return False
@@ -485,11 +499,11 @@ def _matches_last_view(
 def _matches_previous_track(
     lock: TargetLock, frame_pose: FramePose, innovation_yaw_xyz: Array, filter_setup: FilterSetup
 ) -> bool:
-    """True if the pose fits the track before the last accepted pose much better than it fits the
-    current track. The last accepted pose was then most likely wrong: at a low frame rate, a single
+    """True if the last accepted pose was most likely wrong: the new pose fits the track without the
+    last accepted pose much better than it fits the current track. At a low frame rate, a single
     wrong pose can pass the gate and corrupt the velocity of a track from a camera without a
     vehicle. `innovation_yaw_xyz` (4,) is measured minus predicted (yaw, x, y, z) for the current
-    track, rad and m."""
+    track, rad and m. Always False in the world frame."""
     if lock.track_before_last_pose is None or frame_pose.is_in_world_frame:
         return False
     innovation, unclaimed = (
@@ -575,9 +589,10 @@ def _is_rival_accepted(lock: TargetLock, rival: RivalTrack, frame_pose: FramePos
 
 def _is_rival_likely_target(lock: TargetLock, rival: RivalTrack, frame_pose: FramePose) -> bool:
     """True if the rival is most likely the target itself, displaced from the track because the
-    camera moved during lost frames. Since the target was last seen, only the rival has been seen
-    for `MIN_RIVAL_ALONE_IN_VIEW_DURATION_S`, in enough frames and with as many markers as the
-    target."""
+    camera moved during lost frames. That is so if the rival was first seen after the target was
+    last seen, at least `MIN_RIVAL_ALONE_IN_VIEW_DURATION_S` (0.3 s) ago and in at least
+    `MIN_ESTABLISHED_LOCK_FRAMES` (5) frames. If the target was ever seen with both markers, only
+    frames that show both markers of the rival count. Only valid for a camera without a vehicle."""
     if (
         rival.first_seen_at_s < lock.track.t_s
         or frame_pose.t_s - rival.first_seen_at_s < MIN_RIVAL_ALONE_IN_VIEW_DURATION_S
@@ -610,8 +625,9 @@ def predict_corners(
     recent errors (`LastPose.motion_errors`).
 
     Returns (None, last pose) if the vehicle's attitude at either time is unknown, (None, predicted
-    pose) if the corners have no finite projection, and (None, None) if there is no recent pose or
-    the target is predicted to be behind the camera.
+    pose) if the corners have no finite projection, and (None, None) if the last pose is not before
+    `t_s` or more than `MAX_TRACK_GAP_S` (1 s) old, or if the target is predicted to be behind the
+    camera.
     """
     if last_pose is None or not 0.0 < t_s - last_pose.pose.t_s <= MAX_TRACK_GAP_S:
         return None, None
@@ -638,11 +654,12 @@ def predict_corners(
 def update_last_pose(
     previous: LastPose | None, pose: MarkerPose, attitude: VehicleState | None, setup: PoseSetup
 ) -> LastPose:
-    """Return `pose` as the new last pose, with the vehicle's `attitude` (None if unknown).
+    """Return `pose` as the new last pose, with the vehicle's `attitude` at that time (None if
+    unknown) and the updated running errors of the vehicle's estimated motion.
 
-    The running errors of the vehicle's estimated motion are updated by comparing it with the motion
-    seen since `previous`, across the line of sight. They stay unchanged if an attitude is unknown
-    or the previous pose is more than `MAX_TRACK_GAP_S` older.
+    These errors are the differences, across the line of sight, between the vehicle's estimated
+    motion since the `previous` pose and the motion of the target in the image. They stay unchanged
+    if an attitude is unknown or the previous pose is more than `MAX_TRACK_GAP_S` (1 s) older.
     """
     if previous is None:
         return LastPose(pose, attitude)
@@ -665,8 +682,9 @@ def update_last_pose(
 
 
 def is_in_view(position_world_m: Array, attitude: VehicleState, setup: PoseSetup) -> bool:
-    """True if a position (3,), m, in the world frame is in the camera's field of view, given the
-    vehicle's attitude and position."""
+    """True if a position (3,), m, in the world frame of the state estimate is in the image of the
+    vehicle's camera. `attitude` is the vehicle's attitude and position in this frame; `setup`
+    contains the camera and its mounting."""
     R = _R_world_cam(attitude, setup)
     tvec_m = R.T @ (
         position_world_m - attitude.position_m - _vehicle_to_camera_world_m(attitude, setup)

@@ -44,8 +44,9 @@ class CameraModel:
         model: distortion model, ``plumb_bob`` (5 coefficients), ``rational_polynomial`` (8) or
             ``fisheye`` (4).
 
-    Raises InvalidValue for any other form of `K`, because OpenCV only uses fx, fy, cx and cy and
-    silently ignores the other entries.
+    Raises InvalidValue for any other form of `K`, except for a skew (row 0, column 1) of at most
+    `MAX_CAMERA_MATRIX_SKEW_PX`, because OpenCV only uses fx, fy, cx and cy and silently ignores the
+    other entries.
     """
 
     size_px: tuple[int, int]
@@ -71,9 +72,9 @@ mm at 1 m. Larger: an error that no other check detects is accepted."""
 
 
 def check_camera_matrix(K: Array) -> None:
-    """Raise InvalidValue if the camera matrix does not have the form (fx, s, cx), (0, fy, cy), (0,
-    0, 1) with a skew s of at most `MAX_CAMERA_MATRIX_SKEW_PX`, for example because it is
-    transposed."""
+    """Raise InvalidValue if the camera matrix does not have the shape (3, 3) and the form (fx, s,
+    cx), (0, fy, cy), (0, 0, 1) with a skew s of at most `MAX_CAMERA_MATRIX_SKEW_PX` (0.3 px), for
+    example because it is transposed."""
     if K.shape != (3, 3):
         raise InvalidValue(f"the camera matrix must have the shape (3, 3), found {K.shape}")
     if (K[1:, 0] == 0.0).all() and K[2, 1] == 0.0 and K[2, 2] == 1.0:
@@ -118,8 +119,9 @@ class Frame:
 
 
 def to_grey(image: Any) -> NDArray[np.uint8]:
-    """Convert a grey, BGR or BGRA array with 8 or 16 bits to a contiguous 8-bit grey image,
-    (height, width). Of 16 bits, the upper 8 are kept. Raises InvalidValue for anything else."""
+    """Convert a grey, BGR or BGRA image, uint8 or uint16, to a contiguous uint8 grey image (height,
+    width). Of 16 bits, the upper 8 are kept. A grey image may have the shape (height, width) or
+    (height, width, 1). Raises InvalidValue for anything else."""
     if image is None:
         raise InvalidValue(
             "the picture is None: cv2.imread returns None if it cannot read a file as an image"
@@ -178,9 +180,10 @@ class Detection:
 
 @dataclass(frozen=True)
 class EdgeShift:
-    """Common shift of all black-white edges of an image (blooming, gamma). `white_growth_px` is how
-    far white has grown over black; if positive, a marker's black square looks smaller. `sigma_px`
-    is the standard deviation of this growth, and `age_frames` the number of frames since it was
+    """Common shift of all black-white edges of an image (blooming, gamma). `white_growth_px` is the
+    distance by which each edge is displaced from the white side to the black side; if positive, a
+    marker's black square looks smaller than it is, by twice this distance in width. `sigma_px` is
+    the standard deviation of `white_growth_px`, and `age_frames` the number of frames since it was
     measured."""
 
     white_growth_px: float
@@ -191,7 +194,8 @@ class EdgeShift:
 @dataclass(frozen=True, eq=False)
 class Detections:
     """The target's markers as detected in one frame: `large` and `small`, None if not detected, and
-    the image velocity of their corners since the previous detections, `flow_pxps`, px/s."""
+    the image velocity of their corners since the previous detections, `flow_pxps`, px/s.
+    `edge_shift` is the common shift of all black-white edges of the image; None if unknown."""
 
     frame_index: int
     t_s: float
@@ -380,9 +384,10 @@ class LastPose:
 @dataclass(frozen=True, eq=False)
 class TargetLock:
     """The target that the pipeline is locked onto: its last track and pose, the number of frames
-    with an accepted pose (`accepted_frame_count`), and whether any of these poses used both
-    markers. `track_before_last_pose` is the track without its last pose; None after the first
-    pose."""
+    with an accepted pose (`accepted_frame_count`), and whether any of these poses used both markers
+    (`has_shown_both_markers`). The track is in the world frame of the state estimate if
+    `is_in_world_frame` is True, otherwise relative to the gear in the level frame.
+    `track_before_last_pose` is the track without its last pose; None after the first pose."""
 
     track: MarkerTrack
     pose: MarkerPose
@@ -422,8 +427,10 @@ class MarkerPoses:
 
     Attributes:
         poses_by_source: all poses, with the keys ``joint``, ``large`` and ``small`` in this order.
-        poses_by_track: the poses that update a track, by the track's name.
-        do_markers_contradict: True if the two markers contradict each other.
+        poses_by_track: the poses that update a track, by the track's name: ``joint``, or ``large``
+            and ``small``.
+        do_markers_contradict: True if both markers were detected, but the positions computed from
+            each of them differ by more than their errors explain.
     """
 
     poses_by_source: dict[str, MarkerPose] = field(default_factory=dict)
@@ -494,7 +501,8 @@ class PipelineOutput:
     poses: dict[str, MarkerPose]
     target: TargetEstimate | None  # Estimate for the time of the frame.
     stage: VisibleMarkers  # Markers that were detected in this frame.
-    # Number of successive frames in which the two markers contradict each other.
+    # Number of successive accepted frames with both markers in which the markers contradict each
+    # other.
     frames_with_contradicting_markers: int = 0
     picture_kind: PictureKind = "whole"
     # Why the pose from this frame was rejected, or was accepted at an unexpected position; or that
