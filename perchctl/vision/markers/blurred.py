@@ -48,7 +48,8 @@ from perchctl.vision.markers.pattern import (
 from perchctl.vision.markers.photometric_fit import DrawingAlignment, align_drawing
 from perchctl.vision.types import MARKERS, MarkerName
 
-_START_BLURS_PX, _FIRST_BLUR_PX = (1.5, 3.0), 2.0  # Initial guesses of the blur.
+# Initial guesses of the blur: at an expected position, and at a quadrilateral found in the image.
+_START_BLURS_PX, _FIRST_BLUR_PX = (1.5, 3.0), 2.0
 # Largest error of a marker's expected position.
 _MAX_POSITION_ERROR_PX, _MAX_POSITION_ERROR_SIDES = 10.0, 0.5
 _MAX_TEMPLATE_PX, _MIN_TEMPLATE_PX = 96.0, 6
@@ -57,7 +58,8 @@ _MIN_QUAD_CORRELATION = 0.5
 # that does costs the time of a fit.
 _MIN_EXPECTED_MARKER_CORRELATION = 0.45
 _MAX_QUADS_TO_FIT = 3
-_CENTRE_GREY, _OUTSIDE_GREY = 0.3, 0.6  # Grey of areas with unknown content.
+# Whiteness, 0 to 1, of areas with unknown content: inside the marker, and beyond the paper.
+_CENTRE_GREY, _OUTSIDE_GREY = 0.3, 0.6
 # Candidates closer to each other than this fraction of a side count as one.
 _MAX_DUPLICATE_DISTANCE_SIDES = 0.15
 # Distance from the marker's centre up to which the surroundings are certainly paper.
@@ -309,10 +311,13 @@ def is_alignment_confirmed(
 
 
 def excludes_other_codewords(alignment: DrawingAlignment) -> bool:
-    """True if flipping any single bit of the codeword would fit the image clearly worse: no cell
-    looks much like the opposite colour (`worst_cell_flip_fraction`), and this measure is accurate
-    enough for every cell. In tests, `is_alignment_confirmed` wrongly accepted 36 markers with other
-    codewords; each of these had a `worst_cell_flip_fraction` above 0.5."""
+    """True if flipping any single bit of the codeword would make the drawing fit the image clearly
+    worse. How much a cell looks like the opposite colour is measured from 0 (as drawn) to 1
+    (flipped). For the worst cell, this `worst_cell_flip_fraction` must be below
+    `_MAX_CELL_FLIP_FRACTION`, and its standard deviation must be below
+    `_MAX_CELL_FLIP_FRACTION_SIGMA` for every cell. In tests, `is_alignment_confirmed` wrongly
+    accepted 36 markers with other codewords; each of these had a `worst_cell_flip_fraction` above
+    0.5."""
     return (
         alignment.worst_cell_flip_fraction < _MAX_CELL_FLIP_FRACTION
         and alignment.largest_cell_flip_fraction_sigma < _MAX_CELL_FLIP_FRACTION_SIGMA

@@ -102,8 +102,9 @@ def signed_double_area(corners: Array) -> Array:
 
 
 def is_inside_image(corners_px: Array, shape: tuple[int, ...], margin_px: float = 0.0) -> bool:
-    """True if all corners (4, 2) are at least `margin_px` inside the edges of an image with the
-    given `shape` (h, w); False for NaN."""
+    """True if all corners (4, 2) are at least `margin_px` inside the border of an image with the
+    given `shape` (h, w). With a negative margin, corners may be outside the image by that
+    distance. False if a corner is NaN."""
     h, w = shape[:2]
     right, low = w - 1 - margin_px, h - 1 - margin_px
     # NaN yields False.

@@ -61,6 +61,7 @@ _UNCERTAIN_TRUNCATION_MARGIN_PX = 40
 _MIN_SMALL_MARKER_CELL_PX = 8.0
 _MIN_COARSE_CORRELATION = 0.6  # Correlation required after the predicted pose has been shifted.
 _SUFFICIENT_COARSE_CORRELATION = 0.95  # Correlation above which no other range is tried.
+# Sizes of the target in the image that are tried, relative to its predicted size.
 _RANGE_SCALE_CANDIDATES = (1.0, 0.94, 1.06)
 _MIN_CORRELATION, _MIN_TRUNCATED_CONTRAST_GREY = 0.9, 20.0
 _MIN_FOUND_EDGE_POINT_FRACTION = 0.75  # fraction of the edge points in view that must be found
@@ -92,10 +93,14 @@ def is_target_truncated(
     shape: tuple[int, ...],
     hidden_mask: HiddenMask | None = None,
 ) -> bool:
-    """True if every expected marker, with corners (4, 2) px, may be truncated by the border of an
-    image with the given `shape` (h, w), because a corner is outside the image or less than
-    `_UNCERTAIN_TRUNCATION_MARGIN_PX` from its border, or is partly hidden by the vehicle's gear.
-    `hidden_mask` (h, w) is True for pixels that the gear hides. False if no marker is expected."""
+    """True if no expected marker is certain to be completely visible: each has a corner that is
+    outside the image or less than `_UNCERTAIN_TRUNCATION_MARGIN_PX` from its border, or the
+    vehicle's gear hides a part of it. False if no marker is expected.
+
+    `expected_corners_px` contains the predicted corners of each marker, (4, 2) px.
+    `shape` (h, w) is that of the image. `hidden_mask` (h, w) is True for pixels that the
+    gear hides.
+    """
     whole = [
         corners
         for corners in expected_corners_px.values()
@@ -176,8 +181,12 @@ def shows_enough_of_target(
     R_cam_marker: Array, t_cam_marker_m: Array, target: TargetConfig, camera: CameraModel
 ) -> bool:
     """True if the visible part of the target is large enough for a measurement: if the fit of
-    `fit_truncated_markers` to an ideal image would be reliable. The pose of the large marker in the
-    camera frame is given by `R_cam_marker` (3, 3) and `t_cam_marker_m` (3,)."""
+    `fit_truncated_markers` to an ideal image would be reliable. Gear that hides the target is not
+    taken into account.
+
+    `R_cam_marker` (3, 3) and `t_cam_marker_m` (3,) are the pose of the large marker in the camera
+    frame. The marker's axes are x right and y up on the paper, and z out of the paper.
+    """
     patterns = _make_patterns(target)
     pose = RigidPose(R_cam_marker @ _R_MARKER_DRAWING, t_cam_marker_m / (target.large.side_m / 2.0))
     pose_fit = predict_fit_accuracy(pose, _make_target_outline(patterns), camera)
@@ -240,9 +249,13 @@ def _initial_pose(
 def _search_near_pose(
     start: RigidPose, texture: DrawingTexture, coarse_image: CoarseUndistortedImage
 ) -> RigidPose | None:
-    """Search poses that are shifted from `start` across the image and along the line of sight.
-    Return the pose at which the drawing, rendered from `texture`, correlates best with the coarse
-    image; None if the correlation is low everywhere."""
+    """Return the pose near `start` at which the drawing, rendered from `texture`, correlates best
+    with the coarse image; None if the correlation is below `_MIN_COARSE_CORRELATION` everywhere.
+
+    The search covers `_SEARCH_RANGE_NODES` lattice nodes in each direction of the image
+    and the sizes in `_RANGE_SCALE_CANDIDATES`. The rotation is not changed. The search
+    stops at the first size at which the correlation exceeds `_SUFFICIENT_COARSE_CORRELATION`.
+    """
     best, pose, lattice = _MIN_COARSE_CORRELATION, None, coarse_image.lattice
     for growth in _RANGE_SCALE_CANDIDATES:
         t = start.t_cam_drawing_half_sides * (1.0, 1.0, 1.0 / growth)
@@ -269,9 +282,9 @@ def _search_near_pose(
 
 def _is_pose_fit_reliable(pose_fit: PoseFit) -> bool:
     """True if at least `_MIN_FOUND_EDGE_POINT_FRACTION` of the visible edge points were found,
-    their RMS residual is below `_MAX_TRUNCATED_FIT_RESIDUAL_PX`, and the standard deviation of the
-    translation along its most uncertain direction is below `_MAX_CENTRE_SIGMA_HALF_SIDES` (half
-    sides of the large marker)."""
+    their RMS residual is below `_MAX_TRUNCATED_FIT_RESIDUAL_PX`, and the standard deviation
+    of the translation along its most uncertain direction is below
+    `_MAX_CENTRE_SIGMA_HALF_SIDES` (half sides of the large marker)."""
     spread = math.sqrt(
         max(float(np.linalg.eigvalsh(pose_fit.rotation_translation_cov[3:, 3:])[-1]), 0.0)
     )
@@ -483,8 +496,14 @@ def render_drawing(
 
 
 class DrawingMatch(NamedTuple):
-    """How well the image matches the drawing: their correlation, 0 to 1, and the image's
-    contrast from black to white, in grey levels."""
+    """How well the image matches the drawing.
+
+    Attributes:
+        correlation: correlation, 0 to 1, of the image with the drawing after the fit of brightness
+            and contrast. It does not depend on the sign of the contrast.
+        contrast_grey: grey level of white minus grey level of black; negative if the image is
+            inverted.
+    """
 
     correlation: float
     contrast_grey: float
@@ -526,7 +545,8 @@ def correlate_drawing(
 
 # Distance from the target's centre up to which there is certainly paper.
 PAPER_REACH_LARGE_MARKER_HALF_SIDES = 1.25
-_POINTS_PER_LARGE_CELL, _POINTS_PER_SMALL_CELL = 24, 6  # Points along a cell's side.
+# Points along the side of a cell of the large and of the small marker.
+_POINTS_PER_LARGE_CELL, _POINTS_PER_SMALL_CELL = 24, 6
 # Margin at both ends of a cell's side, where the corner of the next cell blurs the edge.
 _EDGE_END_MARGIN_CELLS = 0.15
 # Distance from the centre, in half sides of the small marker, within which it hides the large one.
@@ -543,8 +563,9 @@ class TargetOutline:
             from the target's centre (x right, y down on the paper), and unit normals (n, 2) from
             black to white.
         line_index: index (n,) of the straight line that each point is on.
-        print_error_sigma_half_sides: standard deviation (n,) of the print error of that line.
-        adjacent_cell_width_half_sides: width (n,) of the adjacent cell.
+        print_error_sigma_half_sides: standard deviation (n,) of the printed line's position.
+        adjacent_cell_width_half_sides: width (n,) of a cell of the marker that the point is on, in
+            half sides of the large marker.
         is_on_small_marker: True for edges of the small marker, (n,).
     """
 
@@ -621,9 +642,16 @@ def make_drawing_texture(drawing: MarkerDrawing) -> DrawingTexture:
 
 
 class _CellEdge(NamedTuple):
-    """An edge between a black and a white cell: points (n, 2) along the edge, its unit normal from
-    black to white, a key that is the same for all edges on one straight line, and the width of the
-    cell. Lengths are in half sides of the large marker, from the target's centre."""
+    """An edge of one cell, between black and white.
+
+    Attributes:
+        points_half_sides: points (n, 2) along the edge, in half sides of the large marker from the
+            target's centre (x right, y down on the paper).
+        drawing_normal_to_white: unit normal of the edge, x and y, from black to white.
+        line_key: key of the straight line on which the edge is: ratio of the marker's side to the
+            large marker's, axis of the normal (0 = x, 1 = y), and index of the cell border.
+        adjacent_cell_width_half_sides: width of a cell, in half sides of the large marker.
+    """
 
     points_half_sides: Array
     drawing_normal_to_white: tuple[float, float]
@@ -720,16 +748,19 @@ class RigidPose:
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
-    """A fitted pose and its quality.
+    """A fitted pose and its quality. A point counts as found if its weight in the fit is not zero.
 
     Attributes:
         pose: the pose of the drawing in the camera frame.
-        rotation_translation_cov: covariance (6, 6) of small rotations about (rad) and translations
-            along (half sides of the large marker) the camera's x, y, z.
+        rotation_translation_cov: covariance (6, 6) of small rotations of the drawing about its
+            centre (rad) and of its translation (half sides of the large marker), each along the
+            camera's x, y, z.
         visible_point_count: number of edge points of the drawing that are in the image.
-        found_point_count: number of visible edge points at which an edge was found in the image.
+        found_point_count: number of visible edge points at which the image has an edge that the
+            robust fit did not reject as an outlier.
         found_small_marker_point_count: number of found points on the small marker.
-        rms_residual_px: RMS distance of the edges found in the image from the edges of the drawing.
+        rms_residual_px: RMS distance of the edges in the image from the edges of the drawing,
+            weighted and corrected for the effect of the robust weights; at least 0.03.
     """
 
     pose: RigidPose
@@ -762,9 +793,16 @@ class _EdgePoints:
 
 
 class _GaussNewtonStep(NamedTuple):
-    """A Gauss-Newton step: the change (7,) of rotation about the camera's axes (rad), translation
-    (half sides) and edge shift (px); the inverse (7, 7) of the normal matrix, the weights (n,) of
-    the points, and the variance of one point."""
+    """A Gauss-Newton step for the rotation about the camera's axes (rad), the translation (half
+    sides of the large marker) and the common shift of all edges (px, white over black).
+
+    Attributes:
+        pose_and_edge_shift_change: change (7,) of these unknowns.
+        inverse_normal_matrix: inverse (7, 7) of the normal matrix, which includes the prior.
+        weight: robust weight (n,) of each edge point, 0 to 1; 0 for outliers and where no
+            edge was found.
+        point_variance_px2: variance of the distance of one edge point from its edge.
+    """
 
     pose_and_edge_shift_change: Array
     inverse_normal_matrix: Array
@@ -834,8 +872,13 @@ def fit_pose(
 def predict_fit_accuracy(
     pose: RigidPose, outline: TargetOutline, camera: CameraModel
 ) -> PoseFit | None:
-    """Return the covariance and point counts that `fit_pose` would report for an ideal image of the
-    drawing at `pose` in the camera frame; None if too little of the target is visible."""
+    """Return the result of `fit_pose` for an ideal image of the drawing at `pose` in the camera
+    frame: an edge is found exactly where it is expected at each visible edge point. Return None if
+    fewer than `_MIN_EDGE_POINTS` edge points are in view.
+
+    Only the covariance and the point counts are meaningful. The covariance is optimistic because an
+    RMS residual of only 0.03 px is assumed.
+    """
     edge_points = _edge_points_in_view(
         pose, outline, _PROFILE_HALF_LENGTH_PER_ITERATION_PX[0], camera.size_px[::-1], camera, None
     )

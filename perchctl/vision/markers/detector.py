@@ -117,8 +117,9 @@ def make_aruco_detector(
 
 
 def make_quad_detector(setup: DetectorSetup) -> Any:
-    """Return OpenCV's marker detector, configured to accept nearly any quadrilateral. Its
-    candidates are then compared with blurred markers, whose bits OpenCV cannot read."""
+    """Return OpenCV's marker detector, configured to find nearly any quadrilateral. It also
+    returns the quadrilaterals whose bits it cannot read. The caller compares them with blurred
+    markers (`find_blurred`)."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = 0
     parameters.polygonalApproxAccuracyRate = _LOOSE_POLYGON_ACCURACY_RATE
@@ -158,8 +159,8 @@ _MEAN_GREY_WEIGHT_IN_FILL = 1e-4
 
 def make_hidden_mask(frame: Frame, static_hidden_mask: HiddenMask | None) -> HiddenMask | None:
     """Return the mask (h, w) of the pixels that the vehicle hides in this frame (True); None if
-    `static_hidden_mask` is None. For a single field, `static_hidden_mask` is extended by the rows
-    that are interpolated from hidden ones."""
+    `static_hidden_mask` is None. If the frame is a single field of interlaced video, the mask is
+    extended by the rows that are interpolated from hidden ones."""
     if static_hidden_mask is None or frame.picture_kind not in ("top", "bottom"):
         return static_hidden_mask
     return (

@@ -229,13 +229,17 @@ def refine_corners_by_lines(
     known_edge_shift: EdgeShift | None = None,
 ) -> list[RefinedCorners | None]:
     """Fit lines to the sides of m markers with corners (m, 4, 2) px in the distorted image and
-    intersect them to get refined corners. The result for a marker is None if not all four of its
-    sides were found.
+    intersect them to get refined corners.
 
     `cells_along_border` describes the cells just inside each marker's border. The common shift of
     all edges (growth of white over black) is measured unless the caller passes `known_edge_shift`
     and white is not clipped. If a marker's edges are wide or near the ends of the profiles, the fit
     is repeated with the profiles centred on the edges.
+
+    The result for a marker is None if a side has too few inliers, too little contrast, too large
+    residuals or too much blur, if its cells are smaller than `_MIN_CELL_PX`, or if a corner moved
+    by more than 0.6 cells (and by more than 1.6 px). All results are None if the corners of any
+    marker are degenerate or outside the range of the lens model.
     """
     found = _refine_lines_once(image, raw_corners_px, cells_along_border, camera, known_edge_shift)
     centred = raw_corners_px.copy()
@@ -480,8 +484,9 @@ def _side_bow_px(
 
 
 def _line_normal_outward_signs(markers: MarkerSides, line_nx_ny_c: Array) -> Array:
-    """Return the direction (4m,) of each line's normal, the first two columns of `line_nx_ny_c`
-    (4m, 3): +1 if it points out of its marker, otherwise -1."""
+    """Return a sign (4m,) for each line: +1 if its normal, the first two columns of `line_nx_ny_c`
+    (4m, 3), points out of its marker, -1 if it points into it. A line can have either sign because
+    (n, c) and (-n, -c) describe the same line."""
     corners = markers.corners_normalised
     out = (corners - (_MEAN_OF_FOUR_WEIGHTS @ corners)[:, None]).reshape(-1, 2)
     return np.asarray(np.sign(line_nx_ny_c[:, 0] * out[:, 0] + line_nx_ny_c[:, 1] * out[:, 1]))
@@ -572,11 +577,11 @@ class MarkerSides:
 
     Attributes:
         raw_corners_px: corners (m, 4, 2) in the image, before any refinement.
-        cells_along_border: the cells inside each marker's border.
+        cells_along_border: the cells just inside each marker's border.
         corners_normalised: the corners (m, 4, 2) in normalised image coordinates.
         side_lengths_px: lengths (m, 4).
         cell_width_across_side_px: width (m, 4) of the border, perpendicular to each side.
-        cell_size_px: mean width of a cell, (m,).
+        cell_size_px: width of a cell, the mean over the four sides, (m,).
         widest_marker_index: index of the marker with the widest cells.
         winding_sign: +1 if the corners are in clockwise order, -1 if counterclockwise, (m,).
         px_per_normalised_unit: pixels per unit of normalised coordinates along each side, (4m,).
@@ -595,14 +600,14 @@ class MarkerSides:
 
 @dataclass(frozen=True, eq=False)
 class EdgeData:
-    """Edges measured on n profiles across each side.
+    """Edges measured on n profiles across each side. Each row is one side of a marker.
 
     Attributes:
-        profile_greys: grey values along the profiles, (rows, n, steps + 1).
-        window_half_length_px: half length of the window around the edge, (rows,).
+        profile_greys: grey values along the profiles, from dark to bright, (rows, n, steps + 1).
+        window_half_length_px: half length of the window in which the edge is located, (rows,).
         points_normalised: edge points in normalised image coordinates, (rows, n, 2).
-        weight: weight of each point, 0 for outliers, (rows, n).
-        blur_sigma_px: standard deviation of the blur, (rows,).
+        weight: robust weight of each point, 0 to 1; 0 for outliers, (rows, n).
+        blur_sigma_px: standard deviation of the edge's blur, (rows,).
     """
 
     profile_greys: Floats
@@ -647,9 +652,11 @@ def prepare_marker_sides(
 def measure_edges(
     image: NDArray[np.uint8], markers: MarkerSides, camera: CameraModel, with_inner_edges: bool
 ) -> tuple[EdgeData, EdgeData | None]:
-    """Return the edges of all sides (4m rows), and the four inner edges of the black border of the
-    marker with the widest cells (`widest_marker_index`). The inner edges are None if
-    `with_inner_edges` is False or if that marker's cells are too narrow."""
+    """Measure two sets of edges in the image: the outer edges of the black borders of all markers,
+    with 4m rows, of which rows 4 i to 4 i + 3 belong to marker i; and the four inner edges of the
+    border of the marker with the widest cells (`widest_marker_index`). The inner edges are
+    None if `with_inner_edges` is False or if that marker's cells are not wider than
+    `_MIN_CELL_TO_MEASURE_EDGE_SHIFT_PX`."""
     starts, lengths_px, depth_px = (
         markers.corners_normalised,
         markers.side_lengths_px,
@@ -708,8 +715,9 @@ def measure_edges(
 
 
 def window_and_profile_half_lengths_px(cell_size_px: Array) -> tuple[Array, Array]:
-    """Return two half lengths, px, for each of the given cell sizes (n,): of the windows around
-    edges, and of the profiles across them."""
+    """Return two half lengths, px (n,), for the cell sizes `cell_size_px` (n,): 0.85 cells (1.5 to
+    7 px) for the window in which an edge is located, and 1.5 cells (1.75 to 7 px) for the profile
+    across the edge."""
     window_half_length_px = np.minimum(np.maximum(0.85 * cell_size_px, 1.5), 7.0)
     return window_half_length_px, np.minimum(np.maximum(1.5 * cell_size_px, 1.75), 7.0)
 
@@ -1004,7 +1012,13 @@ def _fit_robust_line(
 
 
 def median_per_row(values: Floats, is_usable: NDArray[np.bool_]) -> Floats:
-    """Return the median (rows,) of the usable values in each row; 0 for a row without any."""
+    """Return the median (rows,) of the usable values in each row; 0 for a row without any.
+
+    `values` and `is_usable` have the shape (rows, `PROFILES_PER_SIDE`). Unusable values are
+    replaced by huge ones, negative in even columns and positive in odd columns, which keep the
+    median where it is. If unequal numbers of even and odd columns are unusable, the result is a
+    value near the median.
+    """
     values = np.where(is_usable, values, _MEDIAN_PRESERVING_FILL_PX)
     values.partition(PROFILES_PER_SIDE // 2, axis=1)
     found = values[:, PROFILES_PER_SIDE // 2]

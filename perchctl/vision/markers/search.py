@@ -119,9 +119,11 @@ def search_half_size_image(
     measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None = None,
 ) -> FoundMarkers | None:
     """Search the window around the expected markers in an image of half the size, which takes 1 ms.
-    The corners returned are in pixels of the full-size image; the arguments are those of `search`.
-    Return None if this search misses a marker that is expected to be completely in view, or if the
-    expected markers are not suitable for it."""
+    The corners returned are in pixels of the full-size image. The arguments are those of
+    `search`. Return None if this search misses a marker that is expected to be
+    completely in view, if fewer than two markers are expected, if none of them is expected to be
+    completely in view, or if the sides of one that is are not longer than
+    `_MIN_MARKER_SIDE_TO_HALVE_IMAGE_PX`."""
     shape = detector_input.image.shape
     in_view = [quad for quad in expected_corners_px.values() if is_inside_image(quad, shape)]
     if (
@@ -150,11 +152,11 @@ def make_search_window(
     small_to_large_side_ratio: float,
     shape: tuple[int, ...],
 ) -> ImageWindow | None:
-    """Return the part of an image with the given `shape` (h, w) to search for the expected markers.
-    If it is nearly the whole image or too narrow, return None; the caller then searches the whole
+    """Return the part of an image with the given `shape` (h, w) to search for the expected
+    markers. If it is nearly the whole image or too narrow, return None; the caller then searches
+    the whole image. The window contains the complete large marker if it may be completely in the
     image. `small_to_large_side_ratio` is the side of the small marker divided by the side of the
-    large one. The window contains the complete large marker if it may be completely in the
-    image."""
+    large one."""
     h, w = shape[:2]
     if "large" in expected_corners_px:
         corners = expected_corners_px["large"]
@@ -314,9 +316,10 @@ def nesting_error_to_tolerance_ratio(
     large_corners_px: Array, small_corners_px: Array, small_to_large_side_ratio: float
 ) -> float:
     """Return the largest distance of the small marker's corners from their expected positions
-    inside the large one, divided by the allowed distance. The two markers form a target if the
-    result is at most 1. `small_to_large_side_ratio` is the side of the small marker divided by the
-    side of the large one."""
+    inside the large one, divided by the allowed distance,
+    `_NESTING_TOLERANCE_SMALL_MARKER_SIDES` sides of the small marker, but at least 2.5 px. The two
+    markers form a target if the result is at most 1. `small_to_large_side_ratio` is the side of the
+    small marker divided by the side of the large one."""
     mapped = scale_square(large_corners_px, small_to_large_side_ratio)
     side_px = mean_side_px(mapped)
     allowed_px = max(_NESTING_TOLERANCE_SMALL_MARKER_SIDES * side_px, 2.5)
