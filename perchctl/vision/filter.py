@@ -149,8 +149,9 @@ class TrackMeasurement:
 
 @cache
 def _import_filterpy_predict() -> Callable[..., tuple[Array, Array]]:
-    """Import filterpy's `predict` only when a filter is made. The import loads much of scipy, which
-    takes a second on a small computer and would delay the start of every command."""
+    """Return filterpy's `predict` function, which is imported at the first call. The import loads
+    much of scipy, which takes a second on a small computer and would delay the start of every
+    command if it were at the top of the module."""
     from filterpy.kalman import predict
 
     loaded: Callable[..., tuple[Array, Array]] = predict
@@ -163,8 +164,8 @@ def make_filter_setup(config: KalmanConfig, is_world_frame: bool = False) -> Fil
 
     With ``kalman.noise: measured``, the noise comes from accelerations and from the covariance of
     each pose; otherwise it is `k1` and `k2` of the paper. The initial standard deviation of the
-    velocity is 5 cm/s in the world frame. In the level frame, it is 30 cm/s, or 1 m/s if
-    ``kalman.noise`` is ``measured``.
+    rates is 5 cm/s and 5 deg/s in the world frame. In the level frame, it is 30 cm/s and 30 deg/s,
+    or 100 cm/s and 100 deg/s if ``kalman.noise`` is ``measured``.
     """
     _import_filterpy_predict()  # import it now so that no frame has to wait for the import
     measured = config.noise == "measured"
@@ -218,9 +219,9 @@ def process_noise_covariance(dt_s: float, target_position_m: Array, setup: Filte
     `target_position_m` (3,) in the track's frame: relative to the gear in level axes, or in the
     world.
 
-    The noise is that of white-noise accelerations, plus the drift of the state estimate in the
-    world frame. In the level frame, it grows with the target's distance because rotations of the
-    frame move a distant target further than a close one. Without
+    The noise is that of white-noise accelerations, plus the drift of the vehicle's state estimate
+    if the track is in the world frame. In the level frame, it grows with the target's distance
+    because rotations of the frame move a distant target further than a close one. Without
     `setup.acceleration_process_noise`, the result is `setup.Q`, which does not depend on `dt_s`.
     """
     noise = setup.acceleration_process_noise
@@ -385,9 +386,10 @@ def _predict_from_state(
     track: MarkerTrack, x: Array, dt_s: float, t_s: float, unseen_frames: int, setup: FilterSetup
 ) -> MarkerTrack:
     """Return the track at `t_s` without a measurement: its covariance is predicted over `dt_s`, and
-    its state is predicted from `x` (8,) instead of the track's own state. The caller has reduced
-    the velocities in `x` if the target was not seen. `unseen_frames` becomes the new track's number
-    of frames since the last measurement."""
+    its state is predicted over `dt_s` from `x` (8,) instead of the track's own state. If the speed
+    in `x` exceeds `setup.max_target_speed_mps`, it is limited first. The caller has reduced the
+    rates in `x` if the target was not seen. `unseen_frames` becomes the new track's number of
+    frames since the last measurement."""
     x = _limit_target_speed(x, setup)
     F = transition_matrix(dt_s)
     x, P = _import_filterpy_predict()(

@@ -100,6 +100,10 @@ def estimate_pose(
     axes, is chosen. Returns None if the corners yield no pose, because there is no finite solution
     in front of the camera, or because the reprojection error (RMS over the corners) is above
     `pose.max_reprojection_px`.
+
+    If the corners of both markers do not fit a flat sheet, and the pose of a curled sheet reduces
+    chi-squared to less than half, the pose of the curled sheet is returned, with the larger
+    chi-squared of the flat one.
     """
     source: _PoseSource = "joint" if len(detections) > 1 else detections[0].marker
     image_points_px = undistort_px(np.concatenate([d.corners_px for d in detections]), setup.camera)
@@ -254,9 +258,11 @@ _MAX_GAUSS_NEWTON_STEPS = 8
 # freedom.
 _CORNER_SIGMA_PRIOR_DOF = 8.0
 
-_MIN_COST_GAIN, _MIN_POSE_STEP = 1.0, 0.005  # The pose step is in rad and m.
-# The nonlinearity is about the squared motion divided by the distance between corners, which is
-# 20 px or more.
+# A step is small enough for the errors to be linear if it reduces the cost by less than the first
+# value and changes each element of the pose, in rad or m, by less than the second one.
+_MIN_COST_GAIN, _MIN_POSE_STEP = 1.0, 0.005
+# A larger reduction is also allowed if no corner moves further than this. The nonlinearity is about
+# the squared motion divided by the distance between corners, which is 20 px or more.
 _MAX_LINEARISED_MOTION_PX = 0.3
 
 
@@ -326,8 +332,11 @@ def solve_pose(points: WeightedCorners, prior: TiltPrior) -> ScoredPose | None:
 
 
 def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | None:
-    """Refine the pose `start`, which must be close to the solution, by Gauss-Newton steps. Each
-    corner is weighted by its standard deviation. Returns None if the steps do not converge."""
+    """Refine the pose `start`, which must be close to the solution, by Gauss-Newton steps. They
+    minimise the sum of the squared reprojection errors after `points.whitening_matrix` has made
+    these independent with unit variance; if `points.allows_for_sheet_curl` is True, errors that
+    curl would cause have less weight. Returns None if the steps do not converge, if the corners do
+    not determine the pose, or if a step moves the marker behind the camera."""
     candidate: PoseCandidate = start
     before = math.inf
     W = points.whitening_matrix
@@ -408,12 +417,11 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
 
 
 def _whitened_sheet_curl_shift(points: WeightedCorners, scored: ScoredPose) -> Array:
-    """Return the shift (2n, 2) of the whitened reprojection errors for one standard deviation of
-    each mode of the sheet's curl. A corner that curl lifts off the sheet moves in the image as if
-    the target moved along its normal."""
+    """Return the shift (2n, 2) of the whitened reprojection errors of `points` at the pose `scored`
+    for one standard deviation of each mode of the sheet's curl (`corner_lift_by_sheet_curl`). If
+    curl lifts a corner off the sheet's plane, its image moves as if the whole target moved along
+    its normal."""
     target_normal_cam = rotation_matrix(scored.rvec_rad)[:, 2]
-    # If curl lifts a corner off the sheet's plane, its image moves as if the whole target moved
-    # along its normal.
     moved = (
         scored.reprojection_jacobian[:, 3:].dot(target_normal_cam)[:, None]
         * points.corner_lift_per_sheet_curl_sigma_m
@@ -468,7 +476,8 @@ def _score_candidate(candidate: PoseCandidate, points: WeightedCorners) -> Score
 
 def _find_flipped_candidates(scored: ScoredPose, points: WeightedCorners) -> list[ScoredPose]:
     """Return the second solution of a planar marker, refined from a candidate whose normal is
-    mirrored about the line of sight. Empty if both normals are nearly the same."""
+    mirrored about the line of sight. The list has at most one pose. It is empty if both normals are
+    nearly the same or if the second solution is not finite and in front of the camera."""
     R = rotation_matrix(scored.rvec_rad)
     normal, sight = R[:, 2], scored.tvec_m / np.linalg.norm(scored.tvec_m)
     other = 2.0 * float(normal @ sight) * sight - normal
@@ -574,9 +583,9 @@ class WeightedCorners:
             errors with unit variance.
         whitened_shift_per_common_error_sigma: whitened shift of the corners for one standard
             deviation of each error that is common to several corners, one column per error (2n, k).
-            These errors are the growth of white over black at all edges,
-            `corner_shift_per_readout_sigma_px` of the detections, and the row jitter in each
-            detection.
+            These errors are the growth of white over black at all edges, the error of the
+            rolling-shutter readout time (`corner_shift_per_readout_sigma_px` of the detections),
+            and the row jitter in each detection.
         corner_lift_per_sheet_curl_sigma_m: result (2n, 2) of `corner_lift_by_sheet_curl`.
         allows_for_sheet_curl: True if the sheet may be curled, which reduces the weight of corners
             that curl would move; False if the sheet is assumed to be flat.
@@ -658,8 +667,8 @@ def compute_corner_weights(
 
 
 def _outward_normals(corners: Array) -> Array:
-    """Return the outward unit normals (m, 4, 2) of the sides of m squares with `corners` (m, 4, 2),
-    in either order. Side k runs from corner k to corner k + 1."""
+    """Return the outward unit normals (m, 4, 2) of the sides of m quadrilaterals with `corners` (m,
+    4, 2), listed clockwise or counterclockwise. Side k runs from corner k to corner k + 1."""
     side = corners.take(_SIDE_END_CORNER_INDICES, axis=1) - corners
     x, y = side[..., 0], side[..., 1]
     length = np.maximum(np.hypot(x, y), 1e-9)
@@ -691,7 +700,7 @@ def _line_whitening_elements(normals: Array, sigma_px: float | Array) -> Array:
     tilt.
 
     `normals` (4, 2) are the lines' unit normals; `sigma_px` is the standard deviation of a line's
-    position at its two corners, a scalar for all lines, or (4,).
+    position at its two corners, px, a scalar for all lines, or (4,).
     """
     across = (normals.T / sigma_px).ravel()
     tilt = across * _TILT_TO_OFFSET_WHITENING_RATIO

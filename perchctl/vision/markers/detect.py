@@ -92,8 +92,9 @@ class DetectionPrior:
         expected_corners_both_markers_px: the predicted corners of both markers, each (4, 2) px; a
             missing marker is derived from the other one. Empty if no target is expected.
         search_mode: the kinds of search for this frame.
-        frame_counter_for_initial_blur: frame counter; its parity selects a small or a large initial
-            blur for the fits to blurred markers (see `find_expected_blurred`).
+        frame_counter_for_initial_blur: counter whose parity selects a small (even) or a large
+            (odd) initial blur for the fits to blurred markers; None to try both (see
+            `find_expected_blurred`).
         was_target_seen_recently: True if a marker was found at most
             `MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S` before this frame; always False if edge fits
             are disabled.
@@ -491,11 +492,11 @@ def _detect(
 def _choose_search_mode(
     frames_without_markers: int | None, is_target_expected: bool, is_line_fit_enabled: bool
 ) -> SearchMode:
-    """Return the kind of search for this frame. If the previous frame showed a marker, the search
-    is near the expected corners. Otherwise, to save time, the kinds of search alternate from frame
-    to frame. If no target is expected, or if `is_line_fit_enabled` is False, the whole image is
-    searched; in the latter case, only for sharp markers. If `frames_without_markers` is None, all
-    kinds are selected regardless of the other arguments."""
+    """Return the kind of search for this frame. If a target is expected and the previous frame
+    showed a marker, the search is near the expected corners. Otherwise, to save time, the kinds of
+    search alternate from frame to frame. If no target is expected, or if `is_line_fit_enabled` is
+    False, the whole image is searched; in the latter case, only for sharp markers. If
+    `frames_without_markers` is None, all kinds are selected regardless of the other arguments."""
     if frames_without_markers is None:
         return "all"
     if not is_line_fit_enabled or (is_target_expected and frames_without_markers % 2):
@@ -713,10 +714,10 @@ def refine_photometrically(
 
 
 def _initial_blur_sigma_px(corners: RefinedCorners | None) -> float:
-    """Return the standard deviation of the initial blur, px, for a photometric fit. It is the blur
-    of the blurriest side if lines were fitted to the sides, without the blur due to sampling (its
-    variance is subtracted); otherwise it is `_DEFAULT_INITIAL_BLUR_SIGMA_PX`, which is also the
-    upper limit."""
+    """Return the standard deviation of the blur, px, at which a photometric fit starts. If lines
+    were fitted to the sides in `corners`, it is the blur of the blurriest side without the blur due
+    to sampling (its variance is subtracted). Otherwise, or if `corners` is None, it is
+    `_DEFAULT_INITIAL_BLUR_SIGMA_PX`, which is also the upper limit."""
     if (
         corners is None
         or not corners.are_corners_fitted
@@ -815,8 +816,8 @@ def add_partly_visible_markers(
     found_corners: _FoundCorners,
     known_edge_shift: EdgeShift | None = None,
 ) -> _FoundCorners:
-    """Return the markers in `found_corners`, plus each marker in `expected_corners_px`, (4, 2)
-    each, that could be fitted to its visible part.
+    """Return the markers in `found_corners`, plus each marker in `expected_corners_px`, (4, 2) px
+    each, whose visible part could be fitted.
 
     If the small marker was found, the large one is expected around it. If only the large marker is
     found, the small one is derived from it and added if the image resembles it. `known_edge_shift`
@@ -888,10 +889,11 @@ _MAX_MOTION_BETWEEN_FIELDS_SIDES = 1.5  # corresponds to 1.9 m/s for the small m
 
 
 def average_field_detections(first: Detections, second: Detections) -> Detections:
-    """Return the mean of the corners in two fields, which does not depend on the order of the
-    fields. A marker that moved by more than 1.5 sides between the fields is not averaged. If any
-    marker can be averaged, markers that cannot are omitted. Otherwise, the detections in one field
-    are returned: the first if it shows a marker, else the second."""
+    """Return the detections of a frame of two interlaced fields, `first` and `second`: the corners
+    of each marker are the mean of its corners in the two fields. A marker that moved by more than
+    1.5 sides between the fields is not averaged. If any marker can be averaged, markers that cannot
+    are omitted. Otherwise, the detections in one field are returned: the first if it shows a
+    marker, else the second."""
     averaged: dict[MarkerName, Detection] = {}
     for name in MARKERS:
         one, other = first.get(name), second.get(name)

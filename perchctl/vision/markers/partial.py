@@ -164,8 +164,9 @@ def _linearize_edges(
     homography (8) and the shift of all edges (px, white over black). `edge_shift_prior` is the
     expected shift and its standard deviation.
 
-    Returns the derivatives (9, rows * n), and the normal matrix (9, 9) and the right-hand side (9,)
-    of the normal equations for edges with a variance of 1 px^2.
+    Returns the derivatives (9, rows * n) of the offsets, and the normal matrix N (9, 9) and the
+    right-hand side g (9,) of the normal equations N x = g for the unknowns x. The covariance of x
+    is the inverse of N times the variance of an edge, px^2.
     """
     u, v = visible_edges.points_half_sides[..., 0], visible_edges.points_half_sides[..., 1]
     nx, ny = (
@@ -266,7 +267,8 @@ def _make_refined_corners(
 
 
 IdentificationEvidence = Literal["bits", "track", "other_marker"]
-"""What identifies a marker: its cells alone, its previous position, or the other marker."""
+"""What identifies a marker: its cells alone ("bits"), the position predicted for it ("track"), or
+the other marker."""
 _MIN_KNOWN_CELL_FRACTION = 0.6
 # A sample counts as glare if it is brighter than white by more than this fraction of the contrast,
 # or if it is at least as bright as this grey level although white is not.
@@ -550,8 +552,8 @@ def _find_clean_profiles(
     window_half_length_px: Array,
     profile_half_length_px: Array,
 ) -> tuple[NDArray[np.bool_], float] | None:
-    """Return for each profile (rows, n) whether it shows a clean step from black to white, and
-    return the grey level of white paper. None if the contrast is too low.
+    """Return two values: for each profile (rows, n), whether it shows a clean step from black to
+    white, and the grey level of white paper. Returns None if the contrast is too low.
 
     Black and white are the medians, over the profiles with `is_unobstructed` (rows, n), of the
     greys on either side of the middle, at 0.6 times `window_half_length_px` (rows,). A clean

@@ -260,8 +260,10 @@ class MarkerDrawing:
 
     The drawing of the large marker also contains the small marker: `small_marker_cell_whiteness`
     are the cells of the small marker, and `small_to_large_side_ratio` is its side divided by the
-    side of the large marker. Nothing of the large marker is printed up to `ring_reach_half_sides`
-    from the centre, the outer edge of the white ring around the small marker.
+    side of the large marker. Nothing of the large marker is printed up to
+    `ring_reach_half_sides` from the centre, the outer edge of the white ring around the small
+    marker.
+
     `paper_reach_half_sides` is half the side of the paper in the marker's coordinates; None if the
     paper is assumed to be infinite."""
 
@@ -285,10 +287,19 @@ def make_marker_drawing(
     ring_reach_half_sides: float = 0.0,
 ) -> MarkerDrawing:
     """Return the drawing of a marker with inner bits `bits` (n, n), 1 = white, to which a black
-    border is added. `small_marker_bits` (m, m), `small_to_large_side_ratio`, the side of the small
-    marker divided by the side of the large one, and `ring_reach_half_sides`, the distance of the
-    outer edge of its white ring from the centre, in half sides of the large marker, describe the
-    small marker in its centre, if any; the paper then ends one cell outside the border."""
+    border is added.
+
+    The other arguments describe the small marker in the centre of a large one, if there is one:
+
+    - `small_marker_bits` (m, m): its inner bits, 1 = white.
+    - `small_to_large_side_ratio`: its side divided by the side of the large marker.
+    - `ring_reach_half_sides`: the distance from the centre to the outer edge of the white
+      ring around it, in half sides of the large marker; if it is less than the half side of the
+      small marker, that half side is used.
+
+    With a small marker, the paper ends one cell outside the border; without one, the paper is
+    assumed to be infinite.
+    """
     cells = np.pad(bits.astype(np.float64), 1)
     if small_marker_bits is None:
         return MarkerDrawing(cells)
@@ -311,8 +322,8 @@ def _cell_coverage(
     """Return the fraction of each node's interval that each cell covers, (nodes, cells), along one
     axis. A node's interval extends `node_reach_half_sides` to each side of its position. The
     `cells_per_side` cells fill the interval from -square_reach_half_sides to
-    square_reach_half_sides; of each cell, only the part up to `covered_reach_half_sides` from the
-    centre counts. Lengths are in half sides from the marker's centre."""
+    square_reach_half_sides; of each cell, only the part up to `covered_reach_half_sides` from
+    the centre counts. Lengths are in half sides from the marker's centre."""
     edges = square_reach_half_sides * np.linspace(-1.0, 1.0, cells_per_side + 1)
     edges = np.clip(edges, -covered_reach_half_sides, covered_reach_half_sides)
     low, high = (
@@ -366,9 +377,11 @@ def render_whiteness_and_off_paper_fraction(
 
 @lru_cache(maxsize=64)
 def render_black_square(cells_per_side: int, nodes_per_side: int) -> NDArray[np.float32]:
-    """Return the whiteness of a black square on white paper, with the size of a marker that has
-    `cells_per_side` cells, including the border, at n by n nodes (`nodes_per_side`) and at a margin
-    of nodes around them, as in `render_whiteness_and_off_paper_fraction`."""
+    """Return the whiteness, 0 to 1, of a plain black square on white paper in place of a marker, at
+    n by n nodes (`nodes_per_side`) and at a margin of `BLUR_MARGIN_NODES` nodes around them. The
+    square has the side of the marker. `cells_per_side`, the marker's number of cells including the
+    border, determines how far the nodes extend beyond it, as in
+    `render_whiteness_and_off_paper_fraction`."""
     return render_whiteness_and_off_paper_fraction(
         MarkerDrawing(np.zeros((cells_per_side, cells_per_side))), nodes_per_side
     )[0]
@@ -377,11 +390,11 @@ def render_black_square(cells_per_side: int, nodes_per_side: int) -> NDArray[np.
 def render_cells(
     drawing: MarkerDrawing, node_positions_half_sides: Array, node_reach_half_sides: float
 ) -> NDArray[np.float32]:
-    """Return the whiteness of the drawing, 0 to 1, at the nodes of a square grid with the
-    coordinates `node_positions_half_sides` along both axes, in half sides from the marker's centre,
-    extended by `BLUR_MARGIN_NODES` nodes on all sides. It is the mean over each node's square,
-    which extends `node_reach_half_sides`, half the spacing, to each side. The surroundings of the
-    marker are white."""
+    """Return the whiteness of the drawing, 0 to 1, at the nodes of a square grid, without blur. The
+    nodes are at `node_positions_half_sides` (n,) along both axes, in half sides from the marker's
+    centre, and the result also has a margin of m = `BLUR_MARGIN_NODES` nodes on all sides: (n + 2m,
+    n + 2m). Each value is the mean over the node's square, which extends `node_reach_half_sides`,
+    half the spacing, to each side. The surroundings of the marker are white."""
     wide = _add_margin_nodes(node_positions_half_sides, node_reach_half_sides)
     C = _cell_coverage(wide, node_reach_half_sides, len(drawing.cell_whiteness), 1.0)
     black = C @ (1.0 - drawing.cell_whiteness) @ C.T
@@ -435,8 +448,10 @@ def blurred_cell_coverage(
 
 
 def blur_nodes(sharp_nodes: NDArray[np.float32], blur_sigma_nodes: float) -> NDArray[np.float32]:
-    """Return the node values after a Gaussian blur with the standard deviation `blur_sigma_nodes`,
-    in node spacings. Both the input and the result have a margin of `BLUR_MARGIN_NODES` nodes on
-    all sides."""
+    """Return the values `sharp_nodes` (k, k) at the nodes of a grid after a Gaussian blur.
+
+    The blur has the standard deviation `blur_sigma_nodes`, in node spacings. Both arrays include a
+    margin of `BLUR_MARGIN_NODES` nodes on all sides, in which the result is less accurate.
+    """
     soft = cv2.GaussianBlur(sharp_nodes, (0, 0), blur_sigma_nodes, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(soft, np.float32)

@@ -398,9 +398,9 @@ def _largest_cell_grey_deviation(
 def _assign_nodes_to_cells(
     grid: SamplingGrid, cells_per_side: int
 ) -> tuple[NDArray[np.intp], Array]:
-    """Return the index (n * n,) of the cell, row by row, that contains each node, and the number of
-    nodes in each cell, at least 1. The index of nodes outside the marker is the number of cells.
-    `cells_per_side` includes the border."""
+    """Return the index (n * n,) of the cell that contains each node, and the number of nodes in
+    each cell, (cells,), but at least 1. Cells are numbered row by row; a node outside the marker
+    has the number of cells as its index. `cells_per_side` includes the border."""
     x, y = (grid.node_uv1[:2] + 1.0) * 0.5 * cells_per_side
     inside = (x >= 0) & (x < cells_per_side) & (y >= 0) & (y < cells_per_side)
     own = y.astype(np.intp) * cells_per_side + x.astype(np.intp)
@@ -415,9 +415,10 @@ def _assign_nodes_to_cells(
 
 
 def _illuminated_jacobian(drawing: RenderedDrawing, illumination: Array) -> Array:
-    """Return the derivatives (9, n * n) of the drawing's grey values with respect to the increment
-    of the homography (8) and the variance of the blur, in squared node spacings. The illumination
-    is given by the coefficients `illumination` (7 or 8,), one per row of `illumination_basis`."""
+    """Return the derivatives (9, n * n) of the drawing's grey values at the nodes with respect to
+    the increment of the homography (8) and the variance of the blur (1), in squared node spacings.
+    `illumination` (7 or 8,) contains the coefficients of the illumination, which converts the
+    drawing to grey values, one per row of `RenderedDrawing.illumination_basis`."""
     contrast_grey, (u, v, _) = float(illumination[GAIN]), drawing.grid.node_uv1
     (white, changes), *others = drawing.blurred_whiteness_and_off_paper_fraction
     bend = min(max(float(illumination[BEND]) / contrast_grey, -0.9), 0.9)
@@ -633,8 +634,8 @@ class RenderedDrawing:
 
     @cached_property
     def blurred_cell_coverage(self) -> Array:
-        """Fraction of each node's width that each row (or column) of cells covers, (n, cells),
-        along one axis and after the blur."""
+        """Fraction of each node's width that each row (or column) of cells covers, along one axis
+        and after the blur: (n, m) for n nodes and m cells per side."""
         half_node = self.drawing.photometric_fit_reach_half_sides / self.grid.nodes_per_side
         return blurred_cell_coverage(
             self.drawing, self.grid.node_positions_half_sides, half_node, self.blur_sigma_nodes
