@@ -76,8 +76,8 @@ DESCENT_MANEUVER = Maneuver(descends_to_floor=True)
 
 # --- by setpoints, and off the magnet ---
 MAX_PEEL_OFF_SETPOINT_BELOW_VEHICLE_M = 0.35
-"""Largest distance of a setpoint below the vehicle, m. Larger: a vehicle that comes off the magnet
-falls."""
+"""Largest distance of a setpoint below the vehicle during a descent by setpoints, m. Larger: a
+vehicle that comes off the magnet falls."""
 PEEL_OFF_MAGNET_TIMEOUT_S = 4.0
 """Time after which a vehicle that has not come off the magnet stops pulling and transfers its
 weight to the magnet, s. Larger: the vehicle pulls for longer, and falls if the magnet lets go
@@ -131,9 +131,9 @@ just before its end, m: with too little thrust, it may float in its own ground e
 motors would let it drop. Larger: the vehicle drops from there. Smaller: a vehicle that touches down
 at the last moment waits for another trajectory."""
 LATE_ONBOARD_LANDING_EXTENSION_LEAD_S = 0.25
-"""Time before the end of its trajectory at which such a landing is extended, s. Larger: a landing
-that is about to touch down is extended. Smaller: if a command is lost, the trajectory ends
-first."""
+"""Time before the end of its trajectory at which the firmware's landing is extended if the vehicle
+is still flying above the estimated ground, s. Larger: a landing that is about to touch down is
+extended. Smaller: if a command is lost, the trajectory ends first."""
 MIN_THRUST_TO_HOVER_RATIO_IF_FLYING = 0.85
 """Thrust, as a fraction of the hover thrust, from which a vehicle that the firmware is landing
 counts as still flying. Once the vehicle is on the floor, and therefore above the end of its
@@ -173,7 +173,8 @@ def record_command(state: PlannerState, command: Command) -> tuple[PlannerState,
 
 
 def begin_landing(state: PlannerState) -> PlannerState:
-    """Return the state in the phase LANDING; unchanged if the landing has begun already."""
+    """Return the state at the start of the phase LANDING; unchanged if the landing has begun
+    already."""
     if state.phase is Phase.LANDING:
         return state
     b, tel = state.belief, state.belief.telemetry
@@ -335,6 +336,11 @@ def has_descent_command_reached_minimum(c: Context) -> bool:
 
 
 def _is_falling_free(c: Context) -> bool:
+    """True if the vehicle has come off the magnet and is falling. During a weight transfer and
+    after the command to stop the motors, it must have slipped off its contact (`has_slipped`).
+    Before that, a contact must be recorded, no catch may be in progress, and the climb rate must be
+    below `MAX_CLIMB_RATE_WHEN_FALLING_OFF_MAGNET_MPS`; during the firmware's own landing, no fall
+    is detected. Always False with old IMU data."""
     b, state = c.belief, c.state
     if not b.is_imu_fresh:
         return False
@@ -413,8 +419,9 @@ def _catch_fall(c: Context) -> Action | None:
 
 
 def _descend_by_setpoints(c: Context) -> Action:
-    """Lower the setpoint at `landing.speed_mps`, vertically below the position at which the landing
-    began."""
+    """Lower the position setpoint at `landing.speed_mps` towards the ground, vertically below the
+    position at which the landing began. With recent telemetry, the setpoint stays within
+    `MAX_PEEL_OFF_SETPOINT_BELOW_VEHICLE_M` below the vehicle."""
     landing, state, b = c.planner.landing, c.state, c.belief
     here = make_setpoint_at_vehicle(c)
     start = here
@@ -572,15 +579,16 @@ def _command_onboard_landing(c: Context) -> Action:
 
 
 def _transfer_weight_to_magnet(c: Context) -> Action:
-    """Reduce the thrust until the magnet carries the vehicle; accept older telemetry than in a
-    perch."""
+    """Reduce the thrust until the magnet carries the vehicle, by raw thrust. The telemetry may be
+    up to `safety.telemetry_hold_s` old, which is older than in a perch."""
     return transfer_weight_by_raw_thrust(c, max_telemetry_age_s=c.safety.telemetry_hold_s)
 
 
 def _complete_weight_transfer_to_magnet(c: Context) -> Action:
-    """Transfer the whole weight to the support and monitor the vehicle. Without telemetry, command
-    a thrust that carries most of the weight: a hanging vehicle then stays in place, and a fallen
-    one does not climb."""
+    """Continue a weight transfer that has begun. If the attitude in the telemetry is older than
+    `safety.telemetry_hold_s`, a fall could not be detected, so the transfer starts over, with
+    a thrust of at most `MIN_COMMANDED_TO_HOVER_THRUST_RATIO` of the hover thrust: a hanging vehicle
+    stays in place, and a fallen one does not climb."""
     if c.belief.attitude_age_s <= c.safety.telemetry_hold_s:
         return _transfer_weight_to_magnet(c)
     part = MIN_COMMANDED_TO_HOVER_THRUST_RATIO * c.belief.hover_thrust

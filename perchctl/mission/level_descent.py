@@ -142,8 +142,9 @@ MAX_THRUST_RAMP_INTEGRATION_STEP_S = 0.1
 
 
 def _visual_motion_if_telemetry_old(c: Context) -> VisualMotion | None:
-    """Return the motion from pictures if the telemetry is old and the pictures are newer; else
-    None."""
+    """Return the vehicle's motion from pictures of the target if the attitude in the telemetry is
+    older than `safety.telemetry_hold_s`, and the pictures are newer and determine a velocity;
+    otherwise None."""
     b, seen = c.belief, c.belief.visual_motion
     old = b.attitude_age_s > c.safety.telemetry_hold_s
     return seen if old and seen.is_velocity_known and seen.t_s > b.telemetry.t_s else None
@@ -166,12 +167,14 @@ def _climb_rate_measured_at_s(c: Context) -> float:
 
 
 def _clamped_time_since_last_tick_s(c: Context) -> float:
-    """Return the time since the previous tick, s, at most `MAX_THRUST_RAMP_INTEGRATION_STEP_S`."""
+    """Return the time since the planner's previous tick, s, limited to the range from 0 to
+    `MAX_THRUST_RAMP_INTEGRATION_STEP_S`."""
     return max(0.0, min(MAX_THRUST_RAMP_INTEGRATION_STEP_S, c.t_s - c.state.t_s))
 
 
 def _climb_rate_measurement_age_s(c: Context) -> float:
-    """Return the age of the vertical speed, s: at least one tick."""
+    """Return the age of the newest measured climb rate, s, from telemetry or pictures: at least the
+    time since the previous tick."""
     return max(1e-3, _clamped_time_since_last_tick_s(c), c.t_s - _climb_rate_measured_at_s(c))
 
 
@@ -194,8 +197,15 @@ def should_begin_with_setpoints(c: Context) -> bool:
 
 
 def descend_level_by_raw_thrust(c: Context) -> Action:
-    """Descend by raw thrust: a rate controller of the vertical speed sets the thrust, and a small
-    tilt brakes the lateral speed and balances the wind."""
+    """Return the planner's new state and the raw-thrust command of a descent without a position: a
+    proportional controller of the sink rate sets the thrust, and a small tilt brakes the lateral
+    speed and balances the wind.
+
+    While the vehicle is not sinking, is supported, should have landed by now, or has detected the
+    floor, the thrust falls steadily instead, down to `MIN_COMMANDED_TO_HOVER_THRUST_RATIO` of the
+    hover thrust, until the magnet lets go or the vehicle stands on the floor. The motors are
+    stopped elsewhere.
+    """
     state, descent, tel, b = c.state, c.state.descent, c.telemetry, c.belief
     dt_s, age_s, measured_s = (
         _clamped_time_since_last_tick_s(c),
@@ -322,13 +332,15 @@ def _find_floor_detection_time_s(
 def _compute_thrust_for_sink_rate(
     c: Context, hover_thrust: float, climb_mps: float, height_m: float
 ) -> float:
-    """Return the thrust, 0..65535, of the proportional sink-rate controller, by the equation in the
-    module docstring: `hover_thrust` is T_h, and `climb_mps` (positive upwards) is v + u, the climb
-    rate including the change that recent commands cause.
+    """Return the thrust of the proportional sink-rate controller, 0..65535 but not yet limited:
 
-    The sink rate setpoint s is smaller below `MAX_NEAR_FLOOR_HEIGHT_M`, or if `height_m` (above the
-    ground) may be wrong, or if v comes from pictures. The gain k falls with the age of v. The
-    cosine is at least `MIN_TILT_COSINE_DIVIDING_THRUST`.
+        thrust = hover_thrust * (1 - k * (climb_mps + s)) / cos(tilt)
+
+    `climb_mps` is the climb rate, positive upwards, including the change that recent commands cause
+    but no measurement shows yet. The sink rate setpoint s, m/s, is smaller below
+    `MAX_NEAR_FLOOR_HEIGHT_M`, or if `height_m` (above the ground) may be wrong, or if the climb
+    rate comes from pictures. The gain k falls with the age of the measured climb rate. The cosine
+    is at least `MIN_TILT_COSINE_DIVIDING_THRUST`.
     """
     b = c.belief
     # Late pictures, and positions that have diverged, may place the floor half a metre too low.
@@ -349,8 +361,9 @@ def _compute_thrust_for_sink_rate(
 
 
 def _forget_contact_after_fall(c: Context) -> PlannerState:
-    """Return the state without its recorded contact if a position or pictures show the vehicle
-    clearly below it, or the accelerometer a fall; otherwise unchanged."""
+    """Return the state without its recorded contact with the target, and without being within the
+    magnet's reach, if the vehicle has come off: a position or pictures show it clearly below the
+    contact, or the accelerometer has shown a fall. Otherwise, the state is unchanged."""
     state, b, seen = c.state, c.belief, _visual_motion_if_telemetry_old(c)
     if b.is_position_valid and b.dead_reckoning_began_at_s is None:
         return forget_contact_when_below(state, MIN_DISTANCE_BELOW_CONTACT_WHEN_DETACHED_M)
@@ -469,6 +482,8 @@ def _world_to_heading_xy(x: float, y: float, yaw_rad: float) -> tuple[float, flo
 
 
 def _wind_compensation_tilt_rad(acceleration_against_wind_mps2: float) -> float:
+    """Return the tilt, rad, at which a hovering vehicle's thrust causes the given horizontal
+    acceleration, limited to `MAX_WIND_COMPENSATION_TILT_RAD`. Both have the same sign."""
     return max(
         -MAX_WIND_COMPENSATION_TILT_RAD,
         min(
@@ -478,6 +493,8 @@ def _wind_compensation_tilt_rad(acceleration_against_wind_mps2: float) -> float:
 
 
 def _compute_braking_tilt_rad(lateral_velocity_mps: float, brake_gain_rad_per_mps: float) -> float:
+    """Return the tilt, rad, against the velocity along one axis: minus the gain times the velocity,
+    limited to `MAX_BRAKE_TILT_RAD`."""
     return max(
         -MAX_BRAKE_TILT_RAD, min(MAX_BRAKE_TILT_RAD, -brake_gain_rad_per_mps * lateral_velocity_mps)
     )

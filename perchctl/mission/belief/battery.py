@@ -219,8 +219,8 @@ def update_battery_fit(
     Before the first load, a reading without thrust is the resting voltage. Under load, the resting
     voltage is the reading plus the fitted sag, passed through a low-pass filter, and the reading is
     added to the sums of the fit. While the thrust is changing, the reading is ignored. A
-    `battery_v` that is NaN or outside the range of a cell counts as missing. The charge that the
-    thrust consumes is then subtracted from the estimate.
+    `battery_v` that is NaN or outside the range of a cell counts as missing: the resting voltage
+    then falls by the charge that the thrust is calculated to consume.
     """
     thrust_fraction = max(0.0, min(1.0, thrust / FULL_THRUST))
     state = replace(
@@ -326,7 +326,7 @@ def charge_fraction_from_rest_v(rest_v: float) -> float:
 
 def rest_v_from_charge_fraction(charge_fraction: float) -> float:
     """Return the resting voltage, V, of a cell with the charge `charge_fraction` (0..1),
-    interpolated linearly in the discharge curve."""
+    interpolated linearly in the discharge curve. Outside 0..1, the curve is extrapolated."""
     return _interpolate(
         DISCHARGE_CURVE_CHARGE_FRACTIONS, DISCHARGE_CURVE_REST_VOLTAGES_V, charge_fraction
     )

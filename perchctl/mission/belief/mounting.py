@@ -94,8 +94,9 @@ def make_camera_mounting_sample(
 
 @dataclass(frozen=True)
 class CameraMountingMonitor:
-    """The sightings since the target came into view, and whether they contradict the camera's
-    mounting in the profile."""
+    """The sightings of the last `CAMERA_MOUNTING_CHECK_WINDOW_S`, and whether they contradict or
+    confirm the camera's mounting in the profile: with the right mounting, the target is stationary
+    in the world."""
 
     sightings: tuple[CameraMountingSample, ...] = ()
     check_paused_until_s: float = -math.inf
@@ -123,10 +124,12 @@ def update_camera_mounting_monitor(
 ) -> CameraMountingMonitor:
     """Return the monitor after one more frame that measured the target.
 
-    Once the vehicle's upward axis has moved far enough, a complex least-squares fit relates the
-    target's apparent motion to that of the axis (module docstring). If the target hardly moves, it
-    is stationary, and more motion of the axis confirms the mounting. The sighting contradicts the
-    mounting if the target moves as a large rotation of the camera would make it move.
+    A camera mounted with a wrong rotation about the vehicle's upward axis makes the target seem to
+    move in the world in proportion to the vehicle's motion, or rather to that of the point where
+    the upward axis meets the target's plane. Once this point has moved far enough, a complex
+    least-squares fit determines the factor. If the target hardly moves, it is stationary, and more
+    motion of the point confirms the mounting. The sighting contradicts the mounting if the fit
+    shows a large rotation of the camera.
 
     Once the mounting is confirmed or found wrong, nothing changes any more. After a jump of the
     target or of the state estimate, the check starts again and pauses for `JUMP_PAUSE_S`. Sightings
@@ -152,6 +155,8 @@ def update_camera_mounting_monitor(
 def _is_target_or_estimate_jump(
     earlier_samples: tuple[CameraMountingSample, ...], sample: CameraMountingSample
 ) -> bool:
+    """True if, since one of `earlier_samples` (oldest first), the vehicle's estimated position has
+    moved too far for a flight, or the target too far for the vehicle's motion to explain it."""
     last = earlier_samples[-1]
     far = MIN_ESTIMATE_JUMP_DISTANCE_M + ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS * (
         sample.t_s - last.t_s
@@ -175,6 +180,9 @@ def _is_target_or_estimate_jump(
 def _judge_camera_mounting(
     monitor: CameraMountingMonitor, previous_contradicting_sighting_count: int
 ) -> CameraMountingMonitor:
+    """Return the monitor with the verdict of its sightings: the target is stationary, or the newest
+    sighting contradicts the mounting and is added to `previous_contradicting_sighting_count`;
+    unchanged if the motion is too small or the fit is ambiguous."""
     aims, targets = (
         [s.up_axis_at_target_height_world_xy_m for s in monitor.sightings],
         [s.target_world_xy_m for s in monitor.sightings],

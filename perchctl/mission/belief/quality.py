@@ -14,9 +14,9 @@ MAX_LATERAL_SPEED_FROM_DRAUGHT_MPS = 0.5
 """Lateral speed that no draught can cause, m/s. Larger: an impact during the press is noticed
 late."""
 MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS = 0.15
-"""Largest velocity that the estimate may gain without the accelerometer, m/s; correct positions
-cause at most 0.07. Larger: positions in the wrong axes displace the vehicle further before they are
-noticed."""
+"""Largest lateral velocity that the estimate may gain without the accelerometer, m/s; correct
+positions cause at most 0.07. Larger: positions in the wrong axes displace the vehicle further
+before they are noticed."""
 MIN_TARGET_DISTANCE_BELOW_VEHICLE_M = 0.3
 """Distance of the target below the vehicle beyond which it cannot be on the ceiling, m."""
 NO_ESTIMATE_CORRECTION_TEXT = (

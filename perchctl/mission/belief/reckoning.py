@@ -101,8 +101,9 @@ MAX_HEIGHT_INTEGRATION_STEP_S = 0.5
 class DeadReckoning:
     """Velocity of the vehicle (world axes), horizontal vector from its gear to the target (world x
     and y), and distance of the gear below the target, integrated from the accelerometer since the
-    last good position or sighting. While they are unknown, the vector's standard deviation and the
-    distance are infinite."""
+    last good position or sighting; and the biases of acceleration and estimated velocity that were
+    learned before. While the vector is unknown, its standard deviation is infinite. While the
+    distance is unknown, it is infinite itself."""
 
     imu: ImuMotion | None = None  # IMU motion up to which this value is integrated
     velocity_mps: Vector = ZERO_VECTOR
@@ -154,12 +155,13 @@ def advance_dead_reckoning(
     since `old`. `sample` is the newest sample of `imu`. At the first sample, after a gap in the
     telemetry, or while the attitude is frozen, the dead reckoning restarts instead.
 
-    - `is_estimate_trusted`: adopt the sample's estimated velocity, and learn from it the bias of
-      the acceleration, which is due to accelerometer and attitude.
+    - `is_estimate_trusted`: pull the reckoned velocity towards the sample's estimated velocity, or
+      adopt it at a restart, and learn from it the bias of the acceleration, which is due to
+      accelerometer and attitude.
     - `is_estimated_velocity_being_corrected`: positions have corrected the estimated velocity
       recently.
-    - `ignores_lateral_estimate`: adopt only the vertical part of the estimated velocity, because
-      the firmware's estimator does not see a lateral push until a position corrects it.
+    - `ignores_lateral_estimate`: use only the vertical part of the estimated velocity, because the
+      firmware's estimator does not see a lateral push until a position corrects it.
     - `is_position_diverged`: the estimated velocity may be in the wrong axes, so keep the reckoned
       velocity, even after a gap in the telemetry.
     """
@@ -206,11 +208,14 @@ def _restart(
     is_position_diverged: bool,
 ) -> DeadReckoning:
     """Return the dead reckoning at the first sample, after a gap in the telemetry, or while the
-    attitude is frozen.
+    attitude is frozen, when `imu` cannot be integrated.
 
-    If the state estimate is trusted, its velocity is adopted. Otherwise, the velocity changes by as
-    much as the estimated velocity did during the gap. With diverged positions, the estimate is not
-    used.
+    If the state estimate is trusted, the velocity becomes `estimated_velocity_mps` (world axes).
+    Otherwise, it changes by as much as the estimated velocity has changed since `old`. With
+    diverged positions, the velocity of `old` is kept, apart from the vertical speed that `imu` has
+    gained. The horizontal vector from the gear to the target becomes unknown. After a gap in the
+    telemetry, the lower bound of the gear's distance below the target allows for the highest climb
+    that is possible during the gap.
     """
     velocity_mps = estimated_velocity_mps if is_estimate_trusted else ZERO_VECTOR
     if is_position_diverged:
@@ -272,8 +277,16 @@ def _integrate_sample(
     ignores_lateral_estimate: bool,
 ) -> DeadReckoning:
     """Return the dead reckoning at `sample`, the newest sample of `imu`, advanced from
-    `previous_imu`, one tick earlier, by the equations in the module docstring. It is unchanged
-    without a new sample. `advance_dead_reckoning` explains the three flags."""
+    `previous_imu`, one tick earlier. It is unchanged without a new sample.
+
+    The velocity changes by what the accelerometer has measured, minus the acceleration bias, and
+    the gear's offset from the target changes by the velocity times the time. If
+    `is_estimate_trusted`, two low-pass filters also pull the velocity towards the sample's
+    estimated velocity and learn the acceleration bias from the difference between measured and
+    estimated acceleration. `ignores_lateral_estimate` restricts these two to the vertical axis.
+    `is_estimated_velocity_being_corrected`: positions correct the estimated velocity, so a lateral
+    velocity that only the accelerometer has measured is forgotten gradually.
+    """
     estimated_velocity_mps, dt_s = sample.velocity_mps, imu.t_s - previous_imu.t_s
     if not dt_s > 0.0:
         return old
@@ -480,7 +493,9 @@ def accumulate_unexplained_position_step(
     """Return the dead reckoning with one more lateral step of the estimated position added to their
     sum, which makes the offset at a contact less certain. A step is the motion from `last` to
     `sample` beyond what the estimated velocity explains. Steps below a threshold that grows with
-    the time between the samples are ignored. After a gap in the samples, no step is added."""
+    the time between the samples are ignored. If more than
+    `MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S` lies between the samples, no step is added, because
+    the step may be the vehicle's motion."""
     dt_s = _position_timestamp_s(sample) - _position_timestamp_s(last)
     if not 0.0 < dt_s <= MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S:
         return old

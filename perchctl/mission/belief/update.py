@@ -134,7 +134,8 @@ def has_tick_gap(belief: Belief, obs: Observation, profile: Profile) -> bool:
 
 
 def start_dead_reckoning(b: Belief) -> Belief:
-    """Return the belief switched permanently to dead reckoning from accelerometer and attitude."""
+    """Return the belief switched permanently to dead reckoning from accelerometer and attitude,
+    which starts at the present height and with the present estimate of the hover thrust."""
     return replace(
         b,
         dead_reckoning_began_at_s=b.obs.t_s,
@@ -144,8 +145,8 @@ def start_dead_reckoning(b: Belief) -> Belief:
 
 
 def reset_phase_dependent_conditions(b: Belief) -> Belief:
-    """Return the belief after a change of maneuver: all conditions restart, except for those that
-    are independent of the phase."""
+    """Return the belief after a change of maneuver: the times since when conditions have been true
+    are forgotten, except for conditions that persist across phases."""
     return replace(
         b, condition_start_times_s=keep_persistent_start_times(b.condition_start_times_s)
     )
@@ -189,7 +190,11 @@ def _update_target(b: Belief) -> Belief:
 
 
 def _reset_after_tick_gap(b: Belief) -> Belief:
-    """Return the belief after a gap in which the planner did not run: all conditions restart."""
+    """Return the belief after a gap in which the planner did not run: the times since when
+    conditions have been true are forgotten, except for conditions that persist across phases.
+    Motors that are off as commanded count as off since the end of the last gap in the telemetry, or
+    since a later time at which they stopped. With the target as the only position source, the
+    position counts as stale in this tick."""
     imu = b.obs.imu
     kept: dict[Condition[Any], float] = keep_persistent_start_times(b.condition_start_times_s)
     off_s = max(imu.motors_stopped_at_s, imu.last_telemetry_gap_ended_at_s)
@@ -209,10 +214,12 @@ def _reset_after_tick_gap(b: Belief) -> Belief:
 
 
 def _shift_remembered_positions(b: Belief) -> Belief:
-    """Return the belief after a jump of the estimate's world frame, which has not moved the
-    vehicle. Ground, contact and all other remembered positions move with the frame. They stay
-    unchanged if samples are missing before the jump, since the vehicle may have moved, or if
-    external positions have just returned and the jump ends a drift."""
+    """Return the belief after a jump of the estimated position, which has moved the estimate's
+    world frame but not the vehicle. The stored positions (take-off, contact, start of the maneuver,
+    setpoint) move with the frame, so that they stay in place relative to the vehicle. They stay
+    unchanged, apart from the setpoint, which moves to the vehicle in any case, if samples are
+    missing before the jump, since the vehicle may have moved, or if external positions have just
+    returned and the jump ends a drift."""
     obs, last = b.obs, b.last_telemetry
     first_estimate_jump_at_s = (
         obs.t_s if b.first_estimate_jump_at_s is None else b.first_estimate_jump_at_s
@@ -341,10 +348,15 @@ def _integrate_dead_reckoning(b: Belief) -> DeadReckoning:
 
 
 def _zero_reckoned_velocity_at_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
-    """Return the dead reckoning with zero velocity if the vehicle has been steady at its contact,
-    or is within the magnet's reach at a thrust too small to support it. Otherwise, the
-    accelerometer's bias would move the estimate of a hanging vehicle out of the magnet's reach
-    within ten seconds."""
+    """Return the dead reckoning `new` with zero velocity if the vehicle is at rest at the target:
+    the gear is within the magnet's reach, the climb rate has been steady for
+    `STILL_AT_CONTACT_DWELL_S` without a recent fall, and either a contact is recorded or the thrust
+    is too small to fly. The lateral velocity becomes zero, and the acceleration bias is learned,
+    only if the lateral velocity is steady as well. With the motors off, the offset from the target
+    is kept.
+
+    Without this, the accelerometer's bias would move the reckoned position of a hanging vehicle out
+    of the magnet's reach within ten seconds."""
     obs = b.obs
     rests = (
         obs.t_s - obs.imu.climb_rate_became_steady_at_s >= STILL_AT_CONTACT_DWELL_S
@@ -401,8 +413,10 @@ def _adopt_visual_inertial_velocity(b: Belief, new: DeadReckoning) -> DeadReckon
 
 
 def _restart_at_sighting(b: Belief, new: DeadReckoning) -> DeadReckoning:
-    """Restart the dead reckoning at each frame that measured the target. With a deck or motion
-    capture, restart it in every tick, from the target's known position in the world."""
+    """Return the dead reckoning `new`, restarted from the target's position relative to the gear
+    after each frame that measured the target. With a deck or motion capture and a valid position,
+    it restarts in every tick, since the target's position in the world is known. If the position
+    has been stale since the last sighting, such a restart leaves the lateral offset unchanged."""
     obs, target = b.obs, b.obs.target
     if target is None:
         return new
@@ -431,11 +445,13 @@ def _restart_at_sighting(b: Belief, new: DeadReckoning) -> DeadReckoning:
 
 
 def _correct_height_of_supported_vehicle(b: Belief, new: DeadReckoning) -> DeadReckoning:
-    """Correct the reckoned height of a supported vehicle, with the target as the only position
-    source.
+    """Return the dead reckoning `new` with the gear at the target's height and no vertical speed if
+    accelerometer and thrust have shown for `perch.contact_dwell_s` that something supports the
+    vehicle, and `new` places the gear less than `MAX_GEAR_BELOW_TARGET_IF_HELD_BY_TARGET_M` below
+    the target. This applies only with the target as the only position source, and not in a descent.
 
-    Late pictures make the vehicle seem lower than it is. A vehicle that is supported just below the
-    target must be touching it, so its distance below the target becomes 0.
+    Late pictures make the vehicle seem lower than it is, but a vehicle that is supported just below
+    the target must be touching it.
     """
     near = (
         b.is_target_position_source
