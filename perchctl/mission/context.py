@@ -14,8 +14,9 @@ from perchctl.vehicle import Telemetry
 
 
 class Context:
-    """Belief and planner state in one tick: the argument of all functions of the transition table's
-    rows, and of the phases' actions (`act`).
+    """What the planner knows in one tick: its belief about vehicle and target, and its own state.
+    It is the argument of the functions that decide whether a transition applies, and of the phases'
+    actions (`act`).
 
     Attributes:
         state: the decisions of the planner so far, `PlannerState`.
@@ -42,12 +43,16 @@ class Context:
 
     @property
     def support(self) -> Support:
-        """What supports the vehicle in this tick. To find out how long this support has lasted,
-        call `true_for_s` with the condition that shows it."""
+        """What supports the vehicle in this tick: the air, a surface that it presses against, the
+        target's magnet, another object or the floor; UNKNOWN if the evidence does not prove one of
+        them. `true_for_s` tells for how long the condition that proves it has been true."""
         return find_support(self.belief)
 
     def true_for_s(self, condition: Condition[Any]) -> float:
-        """Seconds for which a condition has been true; -1 while it is false."""
+        """Seconds for which a condition has been true without interruption; -1 while it is false or
+        the data that it requires is stale. A change of phase or a hold also interrupts it, unless
+        it has `persists_across_phases`. The result is always -1 for a condition that is neither one
+        of the belief's nor one of a phase (`PhaseDefinition.conditions`)."""
         began_s = self.belief.condition_start_times_s.get(condition)
         if began_s is None:
             began_s = self.state.condition_start_times_s.get(condition)

@@ -34,7 +34,8 @@ class PhaseDefinition:
         act: function that returns the new state and the command of each tick.
         exits: the transitions (rows of the table) out of this phase alone, in the order in which
             they are tried; rows that apply in many phases come before them.
-        conditions: the phase's own conditions, whose dwell times its exits use.
+        conditions: conditions that the planner evaluates in every tick, so that the exits of
+            the phase can ask for how long each has been true (`Context.true_for_s`).
     """
 
     phase: Phase

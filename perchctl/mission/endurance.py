@@ -46,8 +46,9 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
     fit, the hover thrust and the predicted durations of attempts and landing. The number of
     attempts is None until the target's position is known.
 
-    If the charge is unknown, the remaining time for attempts is at most the time until row
-    `battery-unknown` lands the vehicle.
+    An attempt is allowed only if a landing and the reserve remain after it, and no more attempts
+    are allowed than the mission has left. Without a recent battery reading, the hover time is None,
+    and the time for attempts is at most the time until row `battery-unknown` lands the vehicle.
     """
     energy = c.belief.battery_fit
     consumed_charge_mah = energy.coulomb_counted_discharge_fraction * c.profile.vehicle.battery_mah
@@ -84,9 +85,10 @@ def _is_battery_reading_missing(c: Context) -> bool:
 def _time_until_landing_must_begin_s(
     c: Context, hover_times: HoverTimes | None, landing_duration_s: float
 ) -> float:
-    """Return the time left for attempts, s: the trusted part of the predicted hover time
-    (`HoverTimes`). Without a prediction or a recent battery reading, the time is at most that until
-    row `battery-unknown` lands the vehicle, minus the landing and the reserve."""
+    """Return the time, s, that is left for attempts before a landing must begin, according to the
+    predicted `hover_times`. Without a recent battery reading, it is also at most the time until row
+    `battery-unknown` lands the vehicle, minus the landing and the reserve; without a prediction
+    (`hover_times` is None), it is that time. Negative if the landing is already overdue."""
     reserve_s = c.safety.energy_reserve_s
     by_charge_s = math.inf
     if hover_times is not None:
@@ -106,10 +108,12 @@ class HoverTimes:
     until_min_load_v_s: float  # until the voltage in hover falls below `safety.min_load_v`
 
     def until_landing_must_begin_s(self, landing_duration_s: float, reserve_s: float) -> float:
-        """Return the time for attempts that can be trusted, s: until row `battery-low` lands the
-        vehicle, or until only a landing and the reserve are left. Low power does not stop the
-        motors, so a landing that has begun goes on until the voltage in hover reaches
-        `safety.min_load_v`."""
+        """Return the time, s, until a landing that takes `landing_duration_s` must begin: the
+        smaller of the time until row `battery-low` lands the vehicle, and the time until the
+        voltage in hover falls below `safety.min_load_v` minus the landing and `reserve_s`. Low
+        power does not stop the motors, so a landing that has begun can use the second time. Of both
+        predictions, only `TRUSTED_HOVER_TIME_FRACTION` is counted. Negative if a landing is
+        overdue."""
         return min(
             TRUSTED_HOVER_TIME_FRACTION * self.until_battery_low_s,
             TRUSTED_HOVER_TIME_FRACTION * self.until_min_load_v_s - landing_duration_s - reserve_s,
@@ -119,13 +123,19 @@ class HoverTimes:
 def predict_hover_times(
     battery_fit: BatteryFit, profile: Profile, hover_thrust_fraction: float, power_train: PowerTrain
 ) -> HoverTimes | None:
-    """Return the hover times at `hover_thrust_fraction` (fraction of full thrust); None if unknown.
+    """Predict the hover times at a constant `hover_thrust_fraction` (fraction of full thrust).
+    Return None if that fraction is not positive, or if the battery fit has no resting voltage or
+    has not seen enough time under load.
 
-    The row `battery-low` applies at the earlier of two events: either the firmware reports low
-    power, `FIRMWARE_LOW_POWER_REPORT_DELAY_S` after the voltage in hover has fallen to the
-    firmware's limit; or the voltage falls below `safety.min_load_v`, in hover or during a press.
-    During a press that is shorter than the debounce time, the voltage may be lower than
-    `safety.min_load_v` by `MAX_VOLTAGE_DIP_BELOW_LIMIT_IN_PRESS_V`.
+    Each time is the charge that remains above a voltage limit, divided by the rate of discharge in
+    hover. The resting voltage at the limit is the limit plus the voltage sag, which is proportional
+    to the thrust.
+
+    The row `battery-low` applies at the earliest of these events: the firmware reports low power,
+    `FIRMWARE_LOW_POWER_REPORT_DELAY_S` after the voltage in hover has fallen to the firmware's
+    limit; the voltage in hover falls below `safety.min_load_v`; or, in a mission that perches, a
+    press would pull the voltage below `safety.min_load_v`. A press that is shorter than the
+    debounce time may pull it lower, by `MAX_VOLTAGE_DIP_BELOW_LIMIT_IN_PRESS_V`.
     """
     if (
         battery_fit.rest_v is None
@@ -174,9 +184,9 @@ class MissionDurations:
 
 def predict_durations(c: Context) -> MissionDurations:
     """Predict the times, s, that the rest of this attempt, each retry and the landing take, from
-    the height of the known target, the speeds in the profile, and typical times of the stages
-    without a set speed. The whole duration of a hover is counted. The target's position must be
-    known."""
+    the target's height, the speeds in the profile, and typical times of the stages without a set
+    speed. The position of the target must be known. In a mission that hovers below the target, its
+    whole hover is counted, even if a part of it is over."""
     planner, hover = c.planner, c.planner.hover
     top_z_m = c.belief.target.vehicle_world_z_when_touching_m - (
         0.0 if hover is None else hover.below_m
@@ -234,8 +244,8 @@ def battery_shortfall_text(c: Context) -> str:
 
 
 def _time_left_without_battery_reading_s(c: Context) -> float:
-    """Return the time left, s, until the row `battery-unknown` lands a vehicle without a battery
-    reading: `safety.battery_stale_s` minus the time since the last reading."""
+    """Return the time, s, until the row `battery-unknown` lands a vehicle that gets no more battery
+    readings: `safety.battery_stale_s` minus the time since the last reading."""
     return c.safety.battery_stale_s - max(
         c.belief.battery_fit.time_since_battery_reading_s, c.obs.battery_reading_age_s
     )

@@ -15,9 +15,12 @@ from perchctl.values import replace
 def observe(
     state: PlannerState, obs: Observation, profile: Profile, maneuver: Maneuver
 ) -> PlannerState:
-    """Return the state with its belief updated by `obs`; `maneuver` is the one that the vehicle is
-    flying. After a gap without ticks, the catch of a falling vehicle is cancelled. After a jump of
-    the estimate, the remembered positions move with it."""
+    """Return the planner's state with its belief updated by the observation `obs`; no decision is
+    made. `maneuver` is the one that the vehicle is flying.
+
+    After a gap without ticks, the phase's conditions restart, and the catch of a falling vehicle is
+    cancelled with its setpoint. After a jump of the estimated position, the positions that the
+    state remembers are shifted by the same amount."""
     if has_tick_gap(state.belief, obs, profile):
         # The setpoint of a catch is far above the vehicle; keeping it would make the vehicle press
         # against the ceiling.
@@ -35,9 +38,13 @@ def observe(
 
 
 def _apply_world_frame_shift(state: PlannerState) -> PlannerState:
-    """Return the state after a jump of the estimate. The firmware's own landing follows a
-    trajectory in the old frame, so position control first catches the vehicle, and then the landing
-    is commanded again."""
+    """Return the state after a jump of the estimated position, which has shifted the world frame:
+    the setpoint and the remembered positions are those of the belief, which has already shifted
+    its own.
+
+    The firmware's own landing follows a trajectory in the old frame. If one is in progress with its
+    motors running, it is forgotten: position control first catches the vehicle, and then the
+    landing is commanded again."""
     b, vehicle_world_z_when_blocked_m = state.belief, state.vehicle_world_z_when_blocked_m
     if (
         state.phase is Phase.LANDING

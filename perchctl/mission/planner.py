@@ -64,8 +64,9 @@ def step_mission(
 def _update_before_decision(
     state: PlannerState, obs: Observation, profile: Profile
 ) -> PlannerState:
-    """Return the state updated with the observation: belief, number of confirmed frames,
-    conditions of the phase, hold, and battery outlook."""
+    """Return the state updated with the observation, before a transition is chosen: the belief, the
+    number of successive frames that measured the target, the errors of a hover, the start times of
+    the phases' conditions, the reason for a hold, and the battery outlook."""
     maneuver = PHASES[state.phase].maneuver
     state = observe(state, obs, profile, maneuver)
     consecutive_target_frames, target = state.consecutive_target_frames, obs.target
@@ -90,8 +91,8 @@ def _update_before_decision(
 
 
 def _add_hover_error(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    """Return the state with the position error of the hover, as measured in the observation's new
-    picture, added to the sums."""
+    """Return the state with the error of position and heading that the new picture shows during a
+    hover added to `state.hover_errors`. The observation must have a target estimate."""
     target, below_m = obs.target, (profile.planner.hover or HoverConfig()).below_m
     assert target is not None
     x_m, y_m, z_m = (float(each) for each in target.e_m)
@@ -101,7 +102,8 @@ def _add_hover_error(state: PlannerState, obs: Observation, profile: Profile) ->
 
 
 def _enter_phase(c: Context, row: Transition) -> PlannerState:
-    """Return the state after the transition of `row` into the next phase."""
+    """Return the state after the transition `row` into its phase `row.to`, prepared by that phase's
+    `enter` function. A transition of severity `BACK_OFF` counts as a failed attempt."""
     state = c.state
     # A commanded press has wound up the integrators, whatever the reported thrust. A vehicle whose
     # fall is being caught runs at full thrust without pressing.
@@ -138,8 +140,9 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
 
 
 def act_in_phase(c: Context) -> Action:
-    """Return the phase's new state and command for this tick. During a hold, the command keeps the
-    setpoint instead, unless RECOVER is catching a fall or ending a press."""
+    """Return the new planner state and the command of this tick, from the `act` function of the
+    present phase. During a hold, the command keeps the setpoint instead, unless RECOVER is catching
+    a fall or ending a press."""
     state = c.state
     # A fall is caught and a press ended even during a hold, since the setpoint is above the
     # vehicle.

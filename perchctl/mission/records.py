@@ -247,8 +247,8 @@ class Tick:
 
     @property
     def contact(self) -> GearToTargetDistance | None:
-        """Distance between gear and target at the contact that was proven; None except in COMPLETE
-        and PERCHED."""
+        """Lateral distance between gear and target at the proven contact, with its standard
+        deviation; None in all phases except COMPLETE and PERCHED."""
         is_at_target = self.state.phase in (Phase.COMPLETE, Phase.PERCHED)
         return self.state.belief.gear_to_target_at_last_contact if is_at_target else None
 
@@ -264,9 +264,10 @@ class Tick:
 
     @property
     def off_and_below_m(self) -> tuple[float, float] | None:
-        """For displays: lateral distance between gear and target, and height of the target above
-        the gear, m. From a proven contact on, these are the distances at the contact. None if
-        unknown."""
+        """For displays: the lateral distance between gear and target, m, at least 0, and the height
+        of the target above the gear, m, positive up. In COMPLETE and PERCHED, these are the
+        distances at the proven contact, with a height of 0. None if the distance at the contact is
+        unknown, or if there is no estimate that may be shown (`target_to_show`)."""
         contact, target = self.contact, self.target_to_show
         if contact is not None and math.isfinite(contact.sigma_m):
             return contact.distance_xy_m, 0.0
@@ -287,13 +288,15 @@ class Tick:
 
     @property
     def camera_latency_above_profile_s(self) -> float:
-        """Latency that is subtracted from the frames' times in addition to the profile's latency,
-        s."""
+        """Latency, s, that is subtracted from the frames' arrival times in addition to the
+        profile's latency. It is estimated in flight, and 0 unless `camera.latency_s` is
+        ``measured``."""
         return self.observation.camera_latency_above_profile_s
 
     @property
     def external_positions(self) -> ExternalPositionStatus | None:
-        """The external positions sent to the vehicle; None with decks."""
+        """Number, rate and age of the external positions sent to the vehicle; None if it is
+        positioned by one of its own decks, so that none are sent."""
         return self.record.external_positions
 
 

@@ -38,8 +38,8 @@ cone of an ascent allows."""
 
 
 def find_transition_diagnosis(transition_name: str) -> VehicleDiagnosis:
-    """Return the diagnosis of the built-in row called `transition_name`; logs store that name.
-    `NONE` for any other name, such as the name of one of your own rows."""
+    """Return the diagnosis of the built-in transition called `transition_name`; logs store that
+    name. Return `NONE` for any other name, such as that of a transition of your own."""
     return next(
         (row.diagnosis for row in TABLE if row.name == transition_name), VehicleDiagnosis.NONE
     )
@@ -69,9 +69,9 @@ class Touchdown:
 @dataclass(frozen=True)
 class CameraFindings:
     """Estimates of a flight's camera: its total latency, s, and the rotation of its mounting
-    relative to the profile about body x, y and z, degrees, each with one standard deviation.
-    `advice` is a tuple of sentences; it is empty if the profile fits, and for a simulated vehicle
-    because its camera is not a real one."""
+    relative to the profile about body x, y and z, degrees, positive by the right-hand rule, each
+    with one standard deviation. `advice` has one sentence for each value in the profile that should
+    be corrected. It is empty if the profile fits, and for a simulated vehicle."""
 
     measured_latency_s: float
     latency_sigma_s: float
@@ -87,8 +87,11 @@ class CameraFindings:
         *,
         simulated: bool = False,
     ) -> CameraFindings:
-        """Return the findings from a flight's estimates, with advice on each error that is beyond
-        its limit and significant at 95 %; no advice if the flight was `simulated`."""
+        """Return the findings from a flight's estimates `camera_errors`, with `camera` as in the
+        profile. There is advice on each error above its limit (`MIN_REPORTED_LATENCY_ERROR_S`,
+        `MIN_REPORTED_ROTATION_ERROR_DEG`) that is also larger than the full width of its 95 %
+        interval, but none on a latency that the profile leaves to be measured, and none at all if
+        the flight was `simulated`."""
         latency_s = camera.start_latency_s + camera_errors.latency_above_profile_s
         x, y, z = (math.degrees(turn) for turn in camera_errors.mount_rotation_from_profile_xyz_rad)
         sx, sy, sz = (math.degrees(sigma) for sigma in camera_errors.mount_rotation_sigma_xyz_rad)
@@ -154,7 +157,8 @@ class HoverReport:
 
     @classmethod
     def from_state(cls, state: PlannerState, profile: Profile) -> HoverReport | None:
-        """Return the report of the newest hover; None if there was none."""
+        """Return the report of the newest hover; None if the mission has no hover, or if no frame
+        of the hover measured the target."""
         hover, errors = profile.planner.hover, state.hover_errors
         if hover is None or not errors.frame_count:
             return None
@@ -243,7 +247,8 @@ class FlightReport:
 
 @dataclass(frozen=True)
 class RestReport:
-    """The rest state of a vehicle, and its touchdown if there was one."""
+    """Where a vehicle rests once its motors are off (`RestState`: for example on the floor, or
+    hanging on the target), and its touchdown if there was one."""
 
     state: RestState
     touchdown: Touchdown | None = None
@@ -261,8 +266,9 @@ class RestReport:
 def report_rest(
     state: PlannerState, obs: Observation, profile: Profile, min_motors_off_s: float
 ) -> RestReport | None:
-    """Return the rest state, with the touchdown unless the magnet or another object holds the
-    vehicle; None until telemetry has shown the motors off for `min_motors_off_s`."""
+    """Return where the vehicle rests (`RestState`), with its touchdown unless the magnet or another
+    object holds it; None until telemetry has shown the motors off for `min_motors_off_s`, in
+    seconds. `obs` is the newest observation, with which the belief in `state` is updated first."""
     c = Context(replace(state, belief=state.belief.with_observation(obs, profile)))
     if c.true_for_s(MOTORS_OFF_AS_COMMANDED) < min_motors_off_s:
         return None

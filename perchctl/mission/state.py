@@ -18,8 +18,8 @@ from perchctl.vehicle import EmergencyStop, PositionSetpoint, StopMotors
 @dataclass(frozen=True)
 class BatteryOutlook:
     """How long the battery lasts: predicted hover time, s, until row `battery-low` would land the
-    vehicle; number of attempts that the battery allows; consumed charge, mAh; and resting voltage,
-    V. None means unknown."""
+    vehicle; number of attempts that the battery allows, with a landing after the last one; charge
+    consumed so far, mAh; and resting voltage (without load), V. None means unknown."""
 
     hover_time_left_s: float | None = None  # hover time until `battery-low` would land the vehicle
     # attempts that the battery allows, with the landing after the last one; None before the first
@@ -31,13 +31,14 @@ class BatteryOutlook:
 
 @dataclass(frozen=True)
 class DescentState:
-    """State of a descent.
+    """The planner's memory of a descent; times are on the loop's clock.
 
-    For a descent by raw thrust: the last commanded thrust, 0..65535 (0 before the descent), since
-    when all commanded thrusts have been too small to fly (inf if the last one was not), the change
-    of the climb rate, positive up, that recent commands cause but no sample shows yet, when the
-    floor was detected (None before), and when a setpoint last gave the firmware a new heading.
-    For the firmware's own landing: when its trajectory ends, and how often it was extended.
+    For a descent by raw thrust: the last commanded thrust, 0..65535 (0 before the descent); the
+    time since which all commanded thrusts have been too small to fly (inf if the last one was not);
+    the time of the newest measured climb rate, and the change of the climb rate, m/s, positive up,
+    that commands have caused since; the time at which the floor was detected (None before); and the
+    time at which a setpoint last gave the firmware a new heading. For the firmware's own landing:
+    the time at which its trajectory ends, and how often it was extended.
     """
 
     last_commanded_raw_thrust: float = 0.0
@@ -100,8 +101,9 @@ class HoverErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class PhaseEntry:
-    """How the present phase was entered: time on the loop's clock, the vehicle's estimated position
-    and heading in the world, and name, reason and diagnosis of the transition."""
+    """How the present phase was entered: time on the loop's clock, s; the vehicle's estimated
+    position, m, and heading, rad, in the world at that time; and the transition's name, its reason
+    in words, its diagnosis, and the stop command that it sends at once, if any."""
 
     t_s: float = 0.0
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # estimated position of the vehicle
@@ -176,8 +178,9 @@ class PlannerState:
         return self.weight_transfer_began_at_s is None and self.motor_stop_commanded_at_s is None
 
     def command_history(self, maneuver: Maneuver) -> CommandHistory:
-        """Return the commands sent so far, in the form that the belief uses; `maneuver` is that of
-        the present phase."""
+        """Return the present setpoint and thrust, and the times of the decisions that the belief
+        needs to interpret its evidence, such as the start of the weight transfer. `maneuver` is the
+        maneuver of the present phase."""
         return CommandHistory(
             maneuver=maneuver,
             maneuver_start_position_m=self.entry.position_m,
