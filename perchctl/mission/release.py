@@ -44,8 +44,8 @@ at once instead of in steps: by then, the onboard integrator has wound up, and i
 itself. Larger: a press whose contact is proven late, because the thrust was not reported, lasts
 longer than 4 s."""
 MIN_RAW_PRESS_TO_HOLDING_THRUST_RATIO = 0.9
-"""Fraction of the holding thrust (`complete.hold_ratio` times hover thrust, too little to fly) down
-to which the raw thrust of a press is lowered."""
+"""The raw thrust of a press is lowered to this fraction of `complete.hold_ratio` times hover
+thrust, the largest thrust that proves that the magnet holds the vehicle (too little to fly)."""
 EXTRA_HANGING_TIME_IF_THRUST_UNCONFIRMED_S = 1.5
 """Additional hang time if the reported thrust does not follow the commanded one, s."""
 
@@ -80,7 +80,8 @@ ONBOARD_POSITION_GAIN_PER_S = 2.0
 
 def end_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     """Return the state, and a setpoint below the vehicle until it has left the contact and the
-    onboard integrators have unwound; None after that, or if the vehicle was not pressed."""
+    onboard integrators have unwound. The setpoint is None after that, after `PRESS_END_TIMEOUT_S`
+    in the phase, or if the phase did not begin with a press (`must_end_press` is False)."""
     state, tel = c.state, c.telemetry
     x, y, z = state.entry.position_m
     if not state.must_end_press:
@@ -145,8 +146,9 @@ def transfer_weight_by_raw_thrust(c: Context, *, max_telemetry_age_s: float = 0.
     """Perform the second stage of the release: reduce raw thrust until the motors stop turning, and
     command the motor stop once the support has carried the whole weight for long enough.
 
-    The stage restarts while the telemetry is older than `max_telemetry_age_s` and too old to count
-    as evidence.
+    With telemetry too old to count as evidence, the vehicle is held by position control instead,
+    and the stage starts over. Such telemetry is still accepted up to an age of
+    `max_telemetry_age_s`; with 0, it is never accepted.
     """
     complete, state, b = c.planner.complete, c.state, c.belief
     if not b.is_imu_fresh and b.attitude_age_s > max_telemetry_age_s:
@@ -173,9 +175,11 @@ def transfer_weight_by_raw_thrust(c: Context, *, max_telemetry_age_s: float = 0.
 
 
 def hold_contact_by_position(c: Context) -> Action:
-    """Hold by position control while the telemetry is old, to stay in contact or to catch an
-    undetected fall. The setpoint is above the recorded contact or, without a contact or a valid
-    position, above the vehicle's last reported height. The weight transfer then starts over."""
+    """Command a position setpoint above the vehicle while the telemetry is old, to stay in contact
+    or to catch an undetected fall. The setpoint is
+    `CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_ON_M` above the recorded contact or, without a
+    contact or a valid position, above the vehicle's last reported height. The weight transfer then
+    starts over."""
     state, tel, b = c.state, c.telemetry, c.belief
     x, y, z_m = tel.position_m
     if b.vehicle_world_z_at_last_contact_m is not None and b.is_position_valid:
@@ -200,8 +204,8 @@ def has_thrust_ramped_down(c: Context) -> bool:
 
 def stop_motors(c: Context) -> Action:
     """Send the stop command, and with it the message that ends high-level setpoints (notify),
-    `STOP_COMMAND_COUNT` times: if a single notify were lost, the firmware's supervisor would lock
-    the hanging vehicle. Send more stop commands while the telemetry shows thrust."""
+    `STOP_COMMAND_COUNT` times: if a single notify were lost, the firmware's supervisor would
+    lock the hanging vehicle. Send more stop commands while the telemetry shows thrust."""
     state, now_s = c.state, c.t_s
     if state.motor_stop_commanded_at_s is None:
         return replace(

@@ -45,9 +45,10 @@ def find_rest_state(c: Context) -> RestState:
     above, and it either has hardly come down since the phase began high above the ground or has a
     recorded contact and is too high to rest on the floor; otherwise, it is on the floor. Without
     such a position, it is on the floor if a tracked target is far above; otherwise, the falls
-    measured since it came within the magnet's reach decide (`_find_rest_state_from_falls`). After a
-    restart of the vehicle, its estimate starts again at the origin, so neither its earlier position
-    nor a target that was last seen before the restart proves anything.
+    measured since it came within the magnet's reach decide
+    (`_find_rest_state_from_falls`). After a restart of the vehicle, its estimate starts
+    again at the origin, so neither its earlier position nor a target that was last seen before the
+    restart proves anything.
     """
     b, state = c.belief, c.state
     if _is_held_by_other_object(c):
@@ -147,7 +148,9 @@ def is_still_hanging(c: Context) -> bool:
 
 
 def is_hanging_with_motors_off(c: Context) -> bool:
-    """True if the motors were stopped while the vehicle was hanging, and it is still hanging."""
+    """True if a motor stop has been commanded and the vehicle is still hanging
+    (`is_still_hanging`). False if a landing found the motors already off and has sent no stop
+    command of its own."""
     motor_stop_commanded_at_s, landing = (
         c.state.motor_stop_commanded_at_s,
         c.state.phase is Phase.LANDING,

@@ -57,8 +57,8 @@ from perchctl.profile import USED_LATENCY_S
 from perchctl.vehicle import CRASHED, LOCKED, TUMBLED
 
 LIFTOFF_HEIGHT_M = 0.05
-"""Height below which the lateral limit of a take-off is `MAX_LATERAL_MOTION_BEFORE_LIFTOFF_M`,
-m."""
+"""Height below which the lateral limit of a take-off is
+`MAX_LATERAL_MOTION_BEFORE_LIFTOFF_M`, m."""
 MAX_LATERAL_MOTION_BEFORE_LIFTOFF_M = 0.12
 """Largest lateral motion of the vehicle before it has lifted off, m. Larger: a wrong mounting tips
 it over."""
@@ -181,8 +181,8 @@ def _lateral_distance_from_setpoint_m(c: Context) -> float:
 
 
 def divergence_reason(c: Context) -> str:
-    """Return a message that says which evidence shows that the positions are wrong, and the
-    possible causes."""
+    """Return a message that says how position control diverges (vertical oscillation, distance from
+    the setpoint, or a velocity that contradicts the accelerometer), and the possible causes."""
     b = c.belief
     if _is_oscillating_vertically(c):
         return (
@@ -234,8 +234,9 @@ def is_outside_fence(c: Context) -> bool:
 
 
 def is_outside_fleet_corridor(c: Context) -> bool:
-    """True if a vehicle of a fleet is where another one may fly, or if its position is unknown. A
-    vehicle without a corridor is never outside."""
+    """True if the vehicle is outside the corridor that its fleet reserves for it
+    (`safety.corridor`), where another vehicle may fly, or if its position is NaN. Always False
+    without a corridor, as in a flight of one vehicle."""
     corridor, (x_m, y_m, _) = c.safety.corridor, c.telemetry.position_m
     return corridor is not None and not corridor.contains(x_m, y_m, c.belief.height_m)
 
@@ -301,8 +302,8 @@ def wrong_camera_mounting_reason(c: Context) -> str:
 
 def is_held_by_target(c: Context) -> bool:
     """True if thrust, position and motion have shown for `HANGING_CONFIRMATION_DWELL_S` that
-    something is holding the vehicle, and if this support is the target's magnet, even though no
-    press has proven a contact."""
+    something is holding the vehicle, and this support is the target's magnet. A press with a proven
+    contact is not necessary: the magnet may catch the vehicle earlier."""
     hangs = c.true_for_s(HANGING) >= HANGING_CONFIRMATION_DWELL_S
     return hangs and c.support is Support.MAGNET
 
@@ -330,19 +331,19 @@ def is_climb_blocked_off_target(c: Context) -> bool:
 
 
 def is_thrust_insufficient_for_takeoff(c: Context) -> bool:
-    """True if the vehicle has taken off too slowly at nearly full thrust for
-    `SLOW_TAKEOFF_DWELL_S`: only the ground effect or a battery that is still rested lifts it, and
-    it would soon sink back."""
+    """True if the vehicle has climbed too slowly at nearly full thrust for
+    `SLOW_TAKEOFF_DWELL_S`, to be used during the take-off. Such a vehicle
+    rises only in the ground effect or on a freshly charged battery, and would soon sink back."""
     return c.true_for_s(SLOW_AT_NEARLY_FULL_THRUST) >= SLOW_TAKEOFF_DWELL_S
 
 
 def is_thrust_insufficient(c: Context) -> bool:
     """True if too little thrust remains to keep flying or to press, as measured or as predicted.
-    Measured: the vehicle has not climbed at full thrust for `NOT_CLIMBING_DWELL_S`, or has hardly
-    climbed at nearly full thrust for `SLOW_HOVER_DWELL_S`. In an ascent, only the first counts,
-    since a weak vehicle that can perch climbs the last part slowly. Predicted, at the stand-off
-    before the press: hover thrust exceeds `MIN_SATURATED_TO_FULL_THRUST_RATIO` times the largest
-    press thrust.
+    Measured: the vehicle has not climbed at full thrust for `NOT_CLIMBING_DWELL_S`,
+    or has hardly climbed at nearly full thrust for `SLOW_HOVER_DWELL_S`. In an
+    ascent, only the first counts, since a weak vehicle that can perch climbs the last part slowly.
+    Predicted, at the stand-off before the press: hover thrust exceeds
+    `MIN_SATURATED_TO_FULL_THRUST_RATIO` times the largest press thrust.
 
     A mission that hovers does not press, so nothing is predicted for it. False while a press is
     being ended.

@@ -168,9 +168,9 @@ def fly_under_target(c: Context, vehicle_world_z_m: float, *, max_up_mps: float 
 def update_lateral_integral(
     c: Context, goal_xy_m: tuple[float, float], dt_s: float
 ) -> tuple[float, float]:
-    """Return the integral (x, y) over time of the lateral position error to `goal_xy_m`, times the
-    gain `integral_per_s`: a shift of the setpoint, m, world axes, that removes the offset which a
-    steady wind leaves.
+    """Return the integral (x, y) over time of the lateral position error to `goal_xy_m`,
+    times the gain `integral_per_s`: a shift of the setpoint, m, world axes, that removes the offset
+    which a steady wind leaves.
 
     The integral is limited, and frozen while the vehicle is still on its way: a large error
     accumulates, and the integral may become large, only while the vehicle hovers in place.
@@ -224,10 +224,11 @@ def correct_setpoint(
     c: Context, reference: PositionSetpoint, *, corrects_height: bool = True
 ) -> PositionSetpoint:
     """Return the setpoint to send so that the vehicle reaches `reference` in spite of wind and
-    onboard control errors, by the equations in the module docstring: the reference plus the lateral
-    integral, the lateral feedback (`_lateral_feedback_shift`), and a height correction of at most
-    `MAX_HEIGHT_CORRECTION_M` from the errors of height and vertical speed (world axes, m). Without
-    `corrects_height`, the height is that of the reference."""
+    onboard control errors: the reference plus the lateral integral, the lateral feedback
+    (`_lateral_feedback_shift`), and a height correction of at most
+    `MAX_HEIGHT_CORRECTION_M` from the height error and the vertical speed (world axes, m; the
+    module docstring has the equations). If `corrects_height` is False, the height is that of the
+    reference."""
     tel = c.telemetry
     rise = (
         HEIGHT_ERROR_GAIN * (reference.z_m - tel.position_m[2])
@@ -304,8 +305,11 @@ def _lateral_error_and_velocity(
 
 
 def lower_held_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
-    """Return the held setpoint one tick later. If the target is the position source and out of
-    view, the setpoint sinks slowly to bring the target back into view."""
+    """Return `setpoint`, which the vehicle holds, one tick later. If the target is the position
+    source and the position is stale because the target is out of view, the setpoint sinks at
+    `HELD_SETPOINT_SINK_RATE_WITHOUT_SIGHTING_MPS`, down to
+    `MIN_HELD_SETPOINT_HEIGHT_M` above the ground, to bring the target back into view.
+    Otherwise, it is unchanged."""
     b = c.belief
     if not (b.is_target_position_source and b.is_position_stale) or b.takeoff_position_m is None:
         return setpoint

@@ -59,12 +59,13 @@ PHASE_CONDITIONS = tuple(each for phase in PHASES.values() for each in phase.con
 
 
 def first_transition(c: Context, table: tuple[Transition, ...] = TABLE) -> Transition | None:
-    """Return the first row that applies, or None to stay. A row from a landing to a phase before it
-    is skipped, whatever the table contains.
+    """Return the first row of `table` that applies: the present phase is one of its phases, and its
+    `when` is true. Return None if no row applies, and the mission stays in its phase. Once the
+    mission is landing, rows to a phase before the landing are skipped.
 
-    If a row applies that keeps the mission in its phase, such as one of the user's own, later rows
-    of severity `CONTINUE` (normal progress) no longer count: the waiting row is returned unless a
-    later row of a higher severity applies.
+    A row that keeps the mission in its phase (a wait) is returned only if no later row of a
+    severity above `CONTINUE` leaves the phase. Later rows of severity `CONTINUE` (normal progress)
+    are skipped, so that a wait delays only normal progress.
     """
     landing, phase = c.state.severity >= Severity.LAND, c.state.phase
     waits: Transition | None = None
@@ -100,10 +101,10 @@ def add_rows(
     exits of the phases.
 
     A row of your own may wait in ALIGN, or lead to an earlier phase, to RECOVER or to LANDING
-    (`TRANSITIONS_ALLOWED_FOR_OWN_ROWS`). Your own rows do not apply in COMPLETE and LANDING. Raises
-    InvalidValue for a row that is not allowed, is not a valid `Transition`, or has a name that is
-    taken. If a function of a row raises in flight, InvalidValue names the row, and the vehicle
-    lands.
+    (`TRANSITIONS_ALLOWED_FOR_OWN_ROWS`). Your own rows do not apply in COMPLETE and LANDING.
+    Raises InvalidValue for a row that is not allowed, is not a valid `Transition`, or has a name
+    that is taken. If a function of a row raises in flight, InvalidValue names the row, and the
+    vehicle lands.
     """
     names, own = {row.name for row in table}, list[Transition]()
     for row in rows if isinstance(rows, Iterable) else (rows,):
@@ -156,8 +157,9 @@ def _check_types(row: object) -> None:
 def _wrap_row_function(
     name: str, function: Callable[[Context], Returned]
 ) -> Callable[[Context], Returned]:
-    """Wrap a function of your own row so that its exceptions become InvalidValue with the row's
-    name."""
+    """Return a function that calls `function` and, if that raises an exception, raises InvalidValue
+    with the row's name instead. `function` is the `when` or `reason` of your own row called
+    `name`."""
 
     def call(c: Context) -> Returned:
         try:

@@ -18,10 +18,12 @@ OutcomeAfterTransition = Outcome | Callable[[Outcome | None], Outcome | None]
 class Transition:
     """A row of the table: from any of `phases` to the phase `to` if `when` returns True.
 
-    `when` is called with a `Context`. `reason`, a string or a function of the context, is shown to
-    the user. `outcome`, a value or a function of the previous outcome, is the reason why the flight
-    ends. `stop_command` is the command that a transition into ABORTED sends at once. `diagnosis` is
-    what the row asserts about the vehicle.
+    `name` identifies the row in logs. `when` is called with a `Context`. `reason`, a string or a
+    function of the context, is shown to the user. `severity` says whether the row is normal
+    progress, a hold, the end of an attempt, a landing or a motor stop. `outcome`, a value or a
+    function of the previous outcome, says why the flight ends; None keeps the previous outcome.
+    `stop_command` is the command that a transition into ABORTED sends at once. `diagnosis` is what
+    the row asserts about the vehicle.
     """
 
     name: str
@@ -35,7 +37,8 @@ class Transition:
     diagnosis: VehicleDiagnosis = VehicleDiagnosis.NONE
 
     def keeps_mission_in(self, phase: Phase) -> bool:
-        """True if the row keeps the mission in this phase instead of leaving it."""
+        """True if this row makes a mission in `phase` wait there: it leads to `phase` and has the
+        severity HOLD."""
         return self.to is phase and self.severity is Severity.HOLD
 
     def reason_text(self, c: Context) -> str:
@@ -60,9 +63,9 @@ def motor_cut_row(
 
 
 def supervisor_abort_row(name: str, supervisor_bit: int, reason: str) -> Transition:
-    """Return a row called `name` that stops the motors and aborts once the firmware's supervisor
-    has set `supervisor_bit`, a bit mask such as `perchctl.vehicle.TUMBLED`. `reason` is shown to
-    the user."""
+    """Return a row called `name` that stops the motors in any airborne phase and ends the flight in
+    ABORTED once the firmware's supervisor has set `supervisor_bit`, a bit mask such as
+    `perchctl.vehicle.TUMBLED`. `reason` is shown to the user."""
 
     def when(c: Context) -> bool:
         return c.telemetry.has_bit(supervisor_bit)
@@ -122,9 +125,10 @@ def back_off_row(
 def abort_during_landing_row(
     name: str, when: Predicate, reason: Reason, diagnosis: VehicleDiagnosis = VehicleDiagnosis.NONE
 ) -> Transition:
-    """Return a row from LANDING to ABORTED, where the motors are stopped, for a landing that could
-    not be completed normally: it applies once `when` is true. The other arguments are the fields of
-    `Transition`."""
+    """Return a row from LANDING to ABORTED, for a landing that could not be confirmed as completed:
+    it applies once `when` is true. The row has no stop command of its own; ABORTED stops the motors
+    if their thrust has been ramped down or the descent has reached its end. The other arguments are
+    the fields of `Transition`."""
     return Transition(
         name,
         {Phase.LANDING},

@@ -57,8 +57,9 @@ def is_aligned(c: Context) -> bool:
 
 
 def is_charge_too_low_for_attempt(c: Context) -> bool:
-    """True if an attempt or a retry is about to begin and the battery has too little charge for
-    it."""
+    """True if the vehicle is about to begin an attempt (it is aligned in ALIGN, or has recovered in
+    RECOVER), attempts are left, and the battery has too little charge for one. Always False before
+    that moment, whatever the charge."""
     begins = is_aligned(c) if c.state.phase is Phase.ALIGN else has_recovered(c)
     return (
         begins
@@ -79,9 +80,9 @@ def planned_hover_height_m(c: Context) -> float | None:
 
 
 def is_hover_height_unsafe(c: Context) -> bool:
-    """True if the vehicle is aligned and would hover lower than `MIN_HELD_SETPOINT_HEIGHT_M` above
-    the ground, or higher than `safety.max_height_m` minus `HOVER_HEIGHT_TOLERANCE_M`. False if the
-    mission does not hover."""
+    """True if the vehicle is aligned and would hover lower than
+    `MIN_HELD_SETPOINT_HEIGHT_M` above the ground, or higher than `safety.max_height_m`
+    minus `HOVER_HEIGHT_TOLERANCE_M`. False if the mission does not hover."""
     height_m = planned_hover_height_m(c)
     if height_m is None or not is_aligned(c):
         return False
@@ -91,7 +92,7 @@ def is_hover_height_unsafe(c: Context) -> bool:
 
 def unsafe_hover_reason(c: Context) -> str:
     """Return a message with the height at which the vehicle would hover and the range of allowed
-    heights."""
+    heights, both above the ground. Only valid in a mission that hovers."""
     hover, height_m = c.planner.hover, planned_hover_height_m(c)
     assert hover is not None
     assert height_m is not None

@@ -36,8 +36,10 @@ TAKEOFF_HEIGHT_REACHED = Condition[Context](
 
 
 def act_in_approach(c: Context) -> Action:
-    """Climb to `takeoff_height_m` above the take-off position by position setpoints, so that the
-    firmware levels the vehicle out if they stop arriving."""
+    """Climb to `planner.takeoff_height_m` above the take-off position at
+    `planner.takeoff_speed_mps`. Near the end of the climb, also fly sideways to
+    `planner.approach_xy_m` if the profile sets it. The command is a position setpoint, so that the
+    firmware levels the vehicle out if no more commands arrive."""
     planner, state, b = c.planner, c.state, c.belief
     assert b.takeoff_position_m is not None
     x, y, z = b.takeoff_position_m

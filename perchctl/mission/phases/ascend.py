@@ -138,14 +138,18 @@ AT_HOVER_POSITION = Condition[Context](
 
 
 def enter_ascend(state: PlannerState, previous_context: Context) -> PlannerState:
-    """Reset the search: if the aligned target is lost later, the search starts from the beginning.
-    `previous_context` is not used."""
+    """Return the state at the start of ASCEND: the count of searched positions is reset, so that a
+    search for a target that is lost later has all its steps again. `previous_context` is not
+    used."""
     del previous_context
     return replace(state, searched_position_count=0)
 
 
 def act_in_ascend(c: Context) -> Action:
-    """Climb only with a fresh target and well inside the cone, and more slowly near the target."""
+    """Stay under the target and climb to the height at which the ascent ends. The setpoint climbs
+    only with a fresh target, with the gear well inside the approach cone, and while it is not far
+    above the vehicle. It climbs at `ascend.speed_mps`, or at `ascend.near_speed_mps` near the
+    target."""
     ascend, target = c.planner.ascend, c.belief.target
     setpoint = c.state.setpoint or make_setpoint_at_vehicle(c)
     goal_z = target.vehicle_world_z_when_touching_m - ascent_end_distance_below_target_m(c)

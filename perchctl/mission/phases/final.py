@@ -14,13 +14,15 @@ from perchctl.vehicle import Idle, StopMotors
 
 
 def stay_idle(c: Context) -> Action:
-    """Stay at rest without sending a command."""
+    """Return the unchanged state and `Idle`: no command is sent."""
     return c.state, Idle()
 
 
 def act_in_aborted(c: Context) -> Action:
-    """Stop the motors once. Without a stop command, the firmware would lock a hanging vehicle whose
-    motors have stopped."""
+    """Send one command in the first tick of ABORTED, and none after that. The command is the stop
+    command of the transition. Without one, the motors are stopped if the thrust has already been
+    ramped down or the descent has reached its end: otherwise, the firmware would lock a vehicle
+    whose setpoints end. In all other cases, nothing is sent."""
     if c.state.stop_or_land_command_count:
         return c.state, Idle()
     ends = (

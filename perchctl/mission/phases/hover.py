@@ -3,9 +3,9 @@
 Up to ASCEND, the mission is the same as for a perch, but ASCEND ends at the hover position instead
 of the stand-off. HOVER itself never climbs. A vehicle that sinks below its hover position, for
 example because the estimated height drifts, climbs back in ASCEND; the hover timer continues if
-that takes at most `MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S`. A vehicle that leaves its hover position
-returns to ALIGN, and the timer restarts. In a completed hover, the vehicle has therefore kept its
-position for the whole time, apart from such climbs.
+that takes at most `MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S`. A vehicle that leaves its
+hover position returns to ALIGN, and the timer restarts. In a completed hover, the vehicle has
+therefore kept its position for the whole time, apart from such climbs.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def hover_config(c: Context) -> HoverConfig:
 
 
 def is_hovering(state: PlannerState) -> bool:
-    """True during a hover, including a climb back to its position."""
+    """True in HOVER, and in an ASCEND in which the vehicle climbs back to the hover height."""
     return state.phase is Phase.HOVER or is_returning_to_hover_height(state)
 
 
@@ -78,8 +78,8 @@ def enter_hover(state: PlannerState, previous_context: Context) -> PlannerState:
 
 
 def act_in_hover(c: Context) -> Action:
-    """Stay under the target at the setpoint's height. Lower the setpoint if the target is nearer
-    than intended."""
+    """Stay under the target at the setpoint's height, and never climb. If the setpoint is more than
+    `MAX_SETPOINT_ABOVE_HOVER_HEIGHT_M` above the hover height, lower it to that limit."""
     old = c.state.setpoint or make_setpoint_at_vehicle(c)
     goal_z_m = c.belief.target.vehicle_world_z_when_touching_m - hover_config(c).below_m
     return fly_under_target(c, min(old.z_m, goal_z_m + MAX_SETPOINT_ABOVE_HOVER_HEIGHT_M))

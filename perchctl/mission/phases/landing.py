@@ -20,10 +20,14 @@ vehicle, s."""
 
 
 def enter_landing(state: PlannerState, previous_context: Context) -> PlannerState:
-    """Start the descent. If the row that started the landing asserts that external positions or the
-    mounting are wrong, the descent does not use them. If the phase in `previous_context`, the
-    context before the transition in the same tick, is RECOVER, the offset of the last touch is
-    forgotten unless the row asserts that the vehicle is hanging there."""
+    """Start the descent, according to the diagnosis of the transition into LANDING.
+
+    If external positions are wrong, or if the target moved with the vehicle in a flight by motion
+    capture (wrong mounting or wrong axes), the descent does not use positions. If the camera's
+    mounting is wrong, the setpoint is dropped. After RECOVER, the phase in `previous_context` (the
+    context before the transition in the same tick), the offset of the last touch is forgotten,
+    unless the diagnosis says that the vehicle is hanging there.
+    """
     diagnosis, b = state.entry.diagnosis, state.belief
     # The mounting may be right and the axes of the motion capture wrong. Position control would
     # then accelerate the landing until the vehicle tips over.

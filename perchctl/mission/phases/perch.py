@@ -40,7 +40,8 @@ that would succeed."""
 
 
 def act_in_perch(c: Context) -> Action:
-    """Raise the setpoint through the target while x, y and heading keep following it.
+    """Raise the setpoint to `perch.press_m` above the height at which the gear touches the target,
+    while x, y and heading keep following the target.
 
     The integral of the lateral error is frozen, and the height is not corrected
     (`corrects_height=False`), because both would wind up against the ceiling. If the profile

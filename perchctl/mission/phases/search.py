@@ -78,9 +78,10 @@ def _limit_move_before_camera_mounting_check(
     start_world_xy_m: tuple[float, float],
     goal_world_xy_m: tuple[float, float],
 ) -> tuple[float, float]:
-    """Return the goal, world x and y (m), moved so that it is at most
+    """Return the goal, world x and y (m). A goal that is further than
     `MAX_LATERAL_MOVE_BEFORE_CAMERA_MOUNTING_CHECK_M` from the vehicle's position at the last
-    sighting in `mounting`, or from `start_world_xy_m` if there was none."""
+    sighting in `mounting` is moved towards that position, to this distance. Without a sighting, the
+    distance is measured from `start_world_xy_m`."""
     if mounting.sightings:
         start_world_xy_m = (
             mounting.sightings[-1].vehicle_world_xy_m.real,
@@ -92,7 +93,8 @@ def _limit_move_before_camera_mounting_check(
 
 
 def target_not_found_reason(c: Context) -> str:
-    """Return a message that says that the target was not found, and why if known."""
+    """Return a message that says that the target was not found, and why if known: the camera's
+    problem or, without one, why a sighting was refused."""
     text, why = "target not found in the allowed attempts", c.obs.camera_problem
     why = why or c.obs.target_refusal_reason
     return f"{text}: {why}" if why else text
