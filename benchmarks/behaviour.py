@@ -97,7 +97,7 @@ def print_decisions(log: Path) -> None:
             "attempts": new.failed_attempts,
             "command": [type(command).__name__, to_exact_json(command)],
             "outcome": None if new.outcome is None else new.outcome.value,
-            "reason": new.reason,
+            "reason": new.transition_reason,
         }
         print(json.dumps(decided))
         if turn.role == "flown":

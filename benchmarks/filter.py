@@ -35,7 +35,7 @@ from perchctl.vision import (
     project,
     square_corners,
 )
-from perchctl.vision.pipeline import step_detections
+from perchctl.vision.pipeline import step_from_detections
 from perchctl.vision.types import Detection, Detections
 
 RATE_HZ = 30.0
@@ -143,7 +143,9 @@ def run(
     state, rows = PipelineState(), []
     for k, moment in enumerate(moments):
         attitude = attitude_of(moment, (abs(bias), bias)) if case.in_world else None
-        state, output = step_detections(state, corners(moment, sigma_px, k, rng), attitude, setup)
+        state, output = step_from_detections(
+            state, corners(moment, sigma_px, k, rng), attitude, setup
+        )
         row = compared(output, *true_error(moment, case.in_world))
         if row is not None:
             rows.append((float(TARGET_M[2] - moment.T_world_body[2, 3]), *row))

@@ -220,7 +220,7 @@ def errors(log: FlightLog) -> Iterator[tuple[float, list[tuple[float, float]]]]:
         known = (
             b.is_position_valid
             and b.dead_reckoning_began_at_s is None
-            and b.dead_reckoning.imu is not None
+            and b.dead_reckoning.imu_at_last_update is not None
         )
         if not known or b.height_m < LEAST_HEIGHT_M or b.obs.t_s - last_s < BEGINS_EVERY_S:
             continue

@@ -72,7 +72,7 @@ class Camera:
 def as_jpeg(frame: Frame) -> Frame:
     data = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, 90])[1]
     image = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), np.uint8)
-    return replace(frame, image=image, encoded=data.tobytes())
+    return replace(frame, image=image, source_jpeg=data.tobytes())
 
 
 def flown(frames: list[Frame], for_s: float, folder: Path) -> tuple[Times, RecordingEnd]:

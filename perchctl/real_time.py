@@ -114,7 +114,7 @@ def fly(
     problem = None if summary is None else summary.log_problem
     if problem is not None:
         warnings.warn(f"the flight log is incomplete: {problem}", Note, stacklevel=2)
-    for sentence in report.detached_watchers:
+    for sentence in report.detached_watcher_messages:
         warnings.warn(sentence, Note, stacklevel=2)
     return Flight(report, log.path, miss_m)
 

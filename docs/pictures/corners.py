@@ -38,7 +38,11 @@ from perchctl.vision.markers.photometric_fit import (
     project_nodes,
     render_blurred,
 )
-from perchctl.vision.markers.search import make_search_window, search, search_half_size_image
+from perchctl.vision.markers.search import (
+    make_search_window,
+    search_for_markers,
+    search_half_size_image,
+)
 from tests.helpers.corner_views import VIEWS, View, findings
 from tests.helpers.markers import SETUP
 from tests.helpers.target_picture import CAMERA
@@ -57,7 +61,7 @@ def edge_fit(file: Path) -> None:
     figure, whole, near = _panels(view)
     markers = prepare_marker_sides(_expected(view)[None], [_LARGE.cells_along_border], CAMERA)
     assert markers is not None
-    edges, _ = measure_edges(view.image, markers, CAMERA, with_inner_edges=False)
+    edges, _ = measure_edges(view.image, markers, CAMERA, must_measure_inner_edges=False)
     used = edges.points_normalised[edges.weight > 0.0]
     at = distort_to_px(used, CAMERA)
     _dots(whole, near, at, "edge on a profile")
@@ -141,7 +145,7 @@ def search_and_refinement(file: Path) -> None:
     """One corner as OpenCV finds it, refined by its neighbourhood, and by an edge fit."""
     view = _view("Search")
     figure, whole, near = _panels(view, zoom_px=_NEARER_PX)
-    raw = search(view.picture, {}).corners_px["large"]
+    raw = search_for_markers(view.picture, {}).corners_px["large"]
     subpix = refine_subpix(view.image, raw, _LARGE.cells_along_border.cells_per_side).corners_px
     near.plot(*raw.T, "s", color=ORANGE, label="found by the search", zorder=5)
     near.plot(*subpix.T, "o", color=VERMILLION, label="subpixel refinement", zorder=5)

@@ -115,7 +115,7 @@ def _difference(
         "failed_attempts": state.failed_attempts,
         "command": command,
         "outcome": state.outcome,
-        "reason": state.reason,
+        "reason": state.transition_reason,
     }
     logged = log_names(TickRecord)
     return comparison.first_difference(

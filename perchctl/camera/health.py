@@ -47,14 +47,14 @@ class FrameHealth:
         """Classify the next frame; only "ok" frames are measurements.
 
         Noise makes each live image differ from the last one, so identical bytes mean that the
-        receiver or the stream repeats an image. Frames marked `Frame.repeated` count as repeated as
-        well, but not as frozen. In recordings (`live` is False), identical images are accepted.
+        receiver or the stream repeats an image. Frames marked `Frame.is_repeated` count as repeated
+        as well, but not as frozen. In recordings (`live` is False), identical images are accepted.
         """
         before, self._picture = self._picture, frame.image
         if live and before is not None and same_bytes(before, frame.image):
             frozen = frame.t_s - self._changed_s >= FROZEN_AFTER_S
             return "frozen" if frozen else "repeated"
-        if live and frame.repeated:
+        if live and frame.is_repeated:
             return "repeated"
         self._changed_s = frame.t_s
         return picture_kind(frame.image)

@@ -25,7 +25,7 @@ class NewestSlot:
 
     An image that the receiver repeats does not replace the original until the original has been
     taken, so that the arrival time is kept. After that, the repetition is returned with the same
-    index and `Frame.repeated`: it shows that the source works, but is not a measurement.
+    index and `Frame.is_repeated`: it shows that the source works, but is not a measurement.
     """
 
     def __init__(self) -> None:
@@ -39,10 +39,10 @@ class NewestSlot:
         """Keep an image with its times of exposure and arrival; `encoded`: its JPEG, if any."""
         if self._last is None or not same_bytes(self._last, image):
             self._last = image
-            self._frame = Frame(self.count, t_s, image, t_arrival_s, encoded=encoded)
+            self._frame = Frame(self.count, t_s, image, t_arrival_s, source_jpeg=encoded)
             self.count += 1
-        elif self._frame is None or self._frame.repeated:
-            self._frame = Frame(self.count - 1, t_s, image, t_arrival_s, repeated=True)
+        elif self._frame is None or self._frame.is_repeated:
+            self._frame = Frame(self.count - 1, t_s, image, t_arrival_s, is_repeated=True)
 
     def take(self) -> Frame | None:
         """Return the newest frame; None if it has already been returned."""
@@ -284,7 +284,7 @@ class LiveSource:
         """Keep an image that has just arrived.
 
         `waited_s`: how much longer than usual its transfer took. `began_s`: arrival time of its
-        first byte, from which the latency is subtracted. `encoded`: as in `Frame`.
+        first byte, from which the latency is subtracted. `encoded`: `Frame.source_jpeg`.
         """
         arrival_s = self._clock()
         t_s = (arrival_s if began_s is None else began_s) - self._latency_s - waited_s
@@ -432,7 +432,7 @@ def mirrored_problem(config: CameraConfig) -> Problem:
 
 def unmirror_frame(frame: Frame) -> Frame:
     """The frame flipped left to right, without its original JPEG bytes."""
-    return replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1]), encoded=None)
+    return replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1]), source_jpeg=None)
 
 
 # --- User name and password in a stream's URL, which are never shown ---

@@ -220,7 +220,7 @@ def fly_and_report(
         try:
             page = stack.enter_context(flight_page(options, view, switch))
             report, miss_m = _session(options, log, panel, switch, page, confirm)
-            detached = report.detached_watchers
+            detached = report.detached_watcher_messages
         except BaseException as error:
             detached = tuple(getattr(error, "__notes__", ()))
             # End the page first: a disk that does not respond can delay closing the log, and

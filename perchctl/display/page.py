@@ -79,7 +79,7 @@ class FlightPage:
 
     def _remember(self, tick: Tick) -> None:
         if not self._past or tick.t_s - self._past[-1][0] >= PAST_PERIOD_S:
-            self._past.append((tick.t_s, *(tick.off_and_below_m or (None, None))))
+            self._past.append((tick.t_s, *(tick.gear_to_target_lateral_and_up_m or (None, None))))
 
     def event(self, event: Event) -> None:
         if event.rest_state is not None:
@@ -122,7 +122,7 @@ def flight_state(
     `drawing_sizes` (`large_m`, `gear_m`). `past`: earlier values for a page that is opened late,
     sent as age in s, offset and distance."""
     state, volts = tick.state, tick.telemetry.battery_v
-    off_m, below_m = tick.off_and_below_m or (None, None)
+    off_m, below_m = tick.gear_to_target_lateral_and_up_m or (None, None)
     ground_m, hover = state.belief.ground_z_m, state.belief.profile.planner.hover
     return {
         "phase": state.phase.value,

@@ -42,7 +42,7 @@ def status_rows(tick: Tick) -> list[tuple[str, str]]:
             else [("outside", _outside_text(tick.external_positions))]
         ),
         *([("hover", _hover_text(state))] if state.phase is Phase.HOVER else []),
-        ("held" if state.pause_reason else "reason", state.pause_reason or state.reason),
+        ("held" if state.pause_reason else "reason", state.pause_reason or state.transition_reason),
     ]
 
 
@@ -50,8 +50,8 @@ def _error_row(tick: Tick) -> list[tuple[str, str]]:
     """The error to the target or, from a proven contact on, the offset at the contact. No row for a
     target that is not seen after the contact or after the flight, because that estimate drifts."""
     target = tick.target_to_show
-    if tick.contact is not None:
-        return [("contact", tick.contact.text)]
+    if tick.gear_to_target_at_contact is not None:
+        return [("contact", tick.gear_to_target_at_contact.text)]
     if target is None:
         return [("error", "no target seen yet")] if tick.target is None else []
     x, y, z = (f"{100.0 * v:+.1f}" for v in target.e_m)

@@ -157,7 +157,7 @@ class FaultyCamera(WrappedSource):
                 image = np.ascontiguousarray(frame.image[:, ::-1])
             case _:
                 return frame
-        return replace(frame, image=image, encoded=None)
+        return replace(frame, image=image, source_jpeg=None)
 
     def _noise(self, image: np.ndarray, mean: float, sigma: float) -> np.ndarray:
         return np.clip(self._rng.normal(mean, sigma, image.shape), 0, 255).astype(np.uint8)

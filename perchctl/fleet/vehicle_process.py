@@ -85,7 +85,7 @@ def fly_vehicle(
         outcome = VehicleOutcome.from_phase(report.phase)
         summary = log.close(report, miss_m if outcome is VehicleOutcome.PERCHED else None)
         assert summary is not None, "the log was closed with a report"
-        for sentence in report.detached_watchers:
+        for sentence in report.detached_watcher_messages:
             _say(sentence)
         return reporter.result_of(outcome, summary, str(log.path))
     except BaseException as error:
@@ -345,12 +345,12 @@ class StatusReporter(Watcher):
 
 def flight_status(tick: Tick) -> Status:
     """Return the status of a vehicle that is flying, is hanging or has landed."""
-    state, telemetry, known_m = tick.state, tick.telemetry, tick.off_and_below_m
+    state, telemetry, known_m = tick.state, tick.telemetry, tick.gear_to_target_lateral_and_up_m
     x_m, y_m, z_m = telemetry.position_m
     return Status(
         stage=Stage.ENDING if state.phase.is_final else Stage.FLYING,
         phase=state.phase,
-        reason=state.pause_reason or state.reason,
+        reason=state.pause_reason or state.transition_reason,
         height_m=z_m - state.belief.ground_z_m,
         error_m=None if known_m is None else known_m[0],
         battery_v=telemetry.battery_v if telemetry.battery_v >= NO_BATTERY_READING_V else None,

@@ -142,7 +142,7 @@ class FlightInputs:
         if frame is not None:
             self.on_frame(frame)
             times_s = frame.t_s, frame.t_arrival_s
-            seen = FrameRecord(frame.index, *times_s, frame.picture_kind, frame.repeated)
+            seen = FrameRecord(frame.index, *times_s, frame.picture_kind, frame.is_repeated)
         self.taken = TickInputs(
             tuple(samples),
             frame=seen,
@@ -494,7 +494,7 @@ class TurnReporter:
             failed_attempts=state.failed_attempts,
             external_positions=external_positions(feed),
             outcome=state.outcome,
-            reason=state.reason,
+            reason=state.transition_reason,
         )
 
     def _counted(self) -> int:

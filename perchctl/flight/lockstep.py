@@ -79,7 +79,7 @@ class LockstepSource:
         frame = self._slot.take()
         if frame is None:
             return None
-        self._count += not frame.repeated
+        self._count += not frame.is_repeated
         return replace(frame, index=self._count - 1)
 
     def problem(self, now_s: float) -> str | None:
@@ -241,7 +241,7 @@ def fly_lockstep(
     )
     if opened is not None:
         flight.close_log(opened)
-    for sentence in report.detached_watchers:
+    for sentence in report.detached_watcher_messages:
         warnings.warn(sentence, Note, stacklevel=2)
     return flight
 

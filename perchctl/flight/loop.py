@@ -125,7 +125,7 @@ def fly(parts: FlightParts) -> FlightReport:
         for sentence in watchers.detached:
             error.add_note(sentence)
         raise
-    return replace(report, detached_watchers=tuple(watchers.detached))
+    return replace(report, detached_watcher_messages=tuple(watchers.detached))
 
 
 def _fly(parts: FlightParts, watchers: Watchers) -> FlightReport:

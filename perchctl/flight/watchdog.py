@@ -28,11 +28,11 @@ from perchctl.mission import (
     OperatorRequest,
     Phase,
     PlannerState,
-    RestReport,
     RestState,
+    RestStateReport,
     SentCommand,
     VisualInertialMotion,
-    report_rest,
+    report_rest_state,
     step_landing,
 )
 from perchctl.perception import History, add_samples
@@ -268,7 +268,7 @@ def rescue(
     position_age_s: Callable[[float], float] = lambda now_s: 0.0,
     on_sent: Callable[[SentCommand], None] = lambda sent: None,
     motion: VisualInertialMotion | None = None,
-) -> RestReport:
+) -> RestStateReport:
     """Land a vehicle that is still flying, without planner, camera and log, within the time that a
     normal landing takes. Return where the vehicle came to rest.
 
@@ -291,7 +291,7 @@ def rescue(
     while (now_s := clock.now()) < start_s + profile.planner.landing.timeout_s:
         if operator() is OperatorRequest.CUT_MOTORS:
             send(EmergencyStop())  # the link's guard repeats it
-            return RestReport(RestState.END_UNCONFIRMED)
+            return RestStateReport(RestState.END_UNCONFIRMED)
         with suppress(Exception):
             history = add_samples(history, link.telemetry(), profile.safety)
         problem: str | None = "the link raised an error"
@@ -312,8 +312,8 @@ def rescue(
             state, command = step_landing(state, obs, profile)
             if not isinstance(command, Idle):
                 send(command)
-            rest = report_rest(state, obs, profile, LOOK_S)
+            rest = report_rest_state(state, obs, profile, LOOK_S)
             if rest is not None:
                 return rest
         clock.wait_until(now_s + period_s)
-    return RestReport(RestState.END_UNCONFIRMED)
+    return RestStateReport(RestState.END_UNCONFIRMED)

@@ -24,10 +24,10 @@ from .records import Watcher as Watcher
 from .report import CameraFindings as CameraFindings
 from .report import FlightReport as FlightReport
 from .report import HoverReport as HoverReport
-from .report import RestReport as RestReport
+from .report import RestStateReport as RestStateReport
 from .report import Touchdown as Touchdown
 from .report import find_transition_diagnosis as find_transition_diagnosis
-from .report import report_rest as report_rest
+from .report import report_rest_state as report_rest_state
 from .rest import RestState as RestState
 from .state import PlannerState as PlannerState
 from .table import add_rows as add_rows

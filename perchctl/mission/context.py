@@ -42,7 +42,7 @@ class Context:
         return self.t_s - self.state.entry.t_s
 
     @property
-    def support(self) -> Support:
+    def vehicle_support(self) -> Support:
         """What supports the vehicle in this tick: the air, a surface that it presses against, the
         target's magnet, another object or the floor; UNKNOWN if the evidence does not prove one of
         them. `true_for_s` tells for how long the condition that proves it has been true."""
@@ -52,7 +52,7 @@ class Context:
         """Seconds for which a condition has been true without interruption; -1 while it is false or
         the data that it requires is stale. A change of phase or a hold also interrupts it, unless
         it has `persists_across_phases`. The result is always -1 for a condition that is neither one
-        of the belief's nor one of a phase (`PhaseDefinition.conditions`)."""
+        of the belief's nor one of a phase (`PhaseDefinition.timed_conditions`)."""
         began_s = self.belief.condition_start_times_s.get(condition)
         if began_s is None:
             began_s = self.state.condition_start_times_s.get(condition)

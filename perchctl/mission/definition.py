@@ -34,7 +34,7 @@ class PhaseDefinition:
         act: function that returns the new state and the command of each tick.
         exits: the transitions (rows of the table) out of this phase alone, in the order in which
             they are tried; rows that apply in many phases come before them.
-        conditions: conditions that the planner evaluates in every tick, so that the exits of
+        timed_conditions: conditions that the planner evaluates in every tick, so that the exits of
             the phase can ask for how long each has been true (`Context.true_for_s`).
     """
 
@@ -43,4 +43,4 @@ class PhaseDefinition:
     act: Callable[[Context], Action]
     enter: Callable[[PlannerState, Context], PlannerState] = keep_state_on_entry
     exits: tuple[Transition, ...] = ()
-    conditions: tuple[Condition[Context], ...] = ()
+    timed_conditions: tuple[Condition[Context], ...] = ()

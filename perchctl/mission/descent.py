@@ -39,17 +39,17 @@ from perchctl.mission.belief.update import (
     KEEPALIVE_RAW_THRUST,
     reset_phase_dependent_conditions,
     start_dead_reckoning,
-    update_after_command,
+    update_thrust_check_after_command,
 )
 from perchctl.mission.context import Context
 from perchctl.mission.level_descent import (
     MIN_COMMANDED_TO_HOVER_THRUST_RATIO,
     MIN_DISTANCE_BELOW_CONTACT_WHEN_DETACHED_M,
     descend_level_by_raw_thrust,
-    should_begin_with_setpoints,
+    should_begin_descent_with_setpoints,
 )
 from perchctl.mission.observation import Observation
-from perchctl.mission.observe import observe
+from perchctl.mission.observe import update_state_with_observation
 from perchctl.mission.phase import Phase, Severity, VehicleDiagnosis
 from perchctl.mission.release import (
     catch_falling_vehicle,
@@ -61,7 +61,7 @@ from perchctl.mission.release import (
 )
 from perchctl.mission.setpoints import (
     Action,
-    limit_setpoint,
+    limit_setpoint_to_fence_and_height,
     make_setpoint_at_vehicle,
     move_setpoint_to_vehicle,
     step_setpoint_towards,
@@ -75,7 +75,7 @@ DESCENT_MANEUVER = Maneuver(descends_to_floor=True)
 """Maneuver of a descent, for all of its policies."""
 
 # --- by setpoints, and off the magnet ---
-MAX_PEEL_OFF_SETPOINT_BELOW_VEHICLE_M = 0.35
+MAX_SETPOINT_DISTANCE_BELOW_VEHICLE_M = 0.35
 """Largest distance of a setpoint below the vehicle during a descent by setpoints, m. Larger: a
 vehicle that comes off the magnet falls."""
 PEEL_OFF_MAGNET_TIMEOUT_S = 4.0
@@ -103,7 +103,7 @@ jumps again and again, position control moves the vehicle in a wrong direction."
 LANDING_COMMAND_PERIOD_S = 0.3
 """Time between landing commands, s. Without its notify message, the firmware does not execute a
 command (docs/firmware.md, "Order without notify")."""
-MIN_LANDING_COMMAND_COUNT = 3
+MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION = 3
 """Number of landing commands before the telemetry can confirm that the vehicle is landing."""
 MAX_LANDING_COMMAND_COUNT = 6
 """Largest number of landing commands."""
@@ -130,7 +130,7 @@ MIN_HEIGHT_ABOVE_GROUND_TO_EXTEND_LANDING_M = 0.06
 just before its end, m: with too little thrust, it may float in its own ground effect, and stopped
 motors would let it drop. Larger: the vehicle drops from there. Smaller: a vehicle that touches down
 at the last moment waits for another trajectory."""
-LATE_ONBOARD_LANDING_EXTENSION_LEAD_S = 0.25
+ONBOARD_LANDING_EXTENSION_LEAD_IF_ABOVE_GROUND_S = 0.25
 """Time before the end of its trajectory at which the firmware's landing is extended if the vehicle
 is still flying above the estimated ground, s. Larger: a landing that is about to touch down is
 extended. Smaller: if a command is lost, the trajectory ends first."""
@@ -158,7 +158,7 @@ def step_landing(
     first call begins the landing. `state` is None if the planner has not run yet."""
     state = state or PlannerState.initial_on_ground(obs, profile)
     state = replace(state, belief=state.belief.with_observation(obs, profile))
-    state = observe(begin_landing(state), obs, profile, DESCENT_MANEUVER)
+    state = update_state_with_observation(begin_landing(state), obs, profile, DESCENT_MANEUVER)
     return record_command(*act_in_landing(Context(state)))
 
 
@@ -168,7 +168,7 @@ def record_command(state: PlannerState, command: Command) -> tuple[PlannerState,
     order = state.commanded_raw_thrust
     if not isinstance(command, Idle):
         order = command.thrust if isinstance(command, RawThrust) else None
-    belief = update_after_command(state.belief, command)
+    belief = update_thrust_check_after_command(state.belief, command)
     return replace(state, belief=belief, commanded_raw_thrust=order, t_s=belief.obs.t_s), command
 
 
@@ -212,7 +212,7 @@ def enter_descent(state: PlannerState, previous_state: PlannerState) -> PlannerS
     ):
         state = replace(
             state,
-            stop_or_land_command_count=MIN_LANDING_COMMAND_COUNT,
+            stop_or_land_command_count=MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION,
             last_stop_or_land_command_at_s=b.obs.t_s,
         )
     elif heard and tel.thrust < 1 and previous_state.motor_stop_commanded_at_s is None:
@@ -249,7 +249,7 @@ def act_in_landing(c: Context) -> Action:
     fall, stop the motors, transfer the weight to the magnet, continue the firmware's own landing,
     or descend."""
     state = c.state
-    if _is_falling_free(c):
+    if _has_fallen_off_magnet(c):
         return _restart_landing_by_catching_fall(c)
     if (
         state.motor_stop_commanded_at_s is None
@@ -335,7 +335,7 @@ def has_descent_command_reached_minimum(c: Context) -> bool:
 # --- Falls, and proof that the vehicle is on the floor ---
 
 
-def _is_falling_free(c: Context) -> bool:
+def _has_fallen_off_magnet(c: Context) -> bool:
     """True if the vehicle has come off the magnet and is falling. During a weight transfer and
     after the command to stop the motors, it must have slipped off its contact (`has_slipped`).
     Before that, a contact must be recorded, no catch may be in progress, and the climb rate must be
@@ -421,7 +421,7 @@ def _catch_fall(c: Context) -> Action | None:
 def _descend_by_setpoints(c: Context) -> Action:
     """Lower the position setpoint at `landing.speed_mps` towards the ground, vertically below the
     position at which the landing began. With recent telemetry, the setpoint stays within
-    `MAX_PEEL_OFF_SETPOINT_BELOW_VEHICLE_M` below the vehicle."""
+    `MAX_SETPOINT_DISTANCE_BELOW_VEHICLE_M` below the vehicle."""
     landing, state, b = c.planner.landing, c.state, c.belief
     here = make_setpoint_at_vehicle(c)
     start = here
@@ -435,18 +435,18 @@ def _descend_by_setpoints(c: Context) -> Action:
     )
     if b.telemetry_age_s <= c.safety.telemetry_hold_s:
         setpoint = replace(
-            setpoint, z_m=max(setpoint.z_m, here.z_m - MAX_PEEL_OFF_SETPOINT_BELOW_VEHICLE_M)
+            setpoint, z_m=max(setpoint.z_m, here.z_m - MAX_SETPOINT_DISTANCE_BELOW_VEHICLE_M)
         )
     state = forget_contact_when_below(state, MIN_DISTANCE_BELOW_CONTACT_WHEN_DETACHED_M)
     state = replace(state, setpoint=setpoint, catch_setpoint_height_above_vehicle_m=None)
-    dx, dy = state.lateral_integral_m
+    dx, dy = state.integral_setpoint_shift_xy_m
     sent = replace(setpoint, x_m=setpoint.x_m + dx, y_m=setpoint.y_m + dy)
-    return state, limit_setpoint(c, sent)
+    return state, limit_setpoint_to_fence_and_height(c, sent)
 
 
 def _descend_by_raw_thrust(c: Context) -> Action:
     """Descend level by raw thrust. With old telemetry and a hover thrust that is not known well
-    enough, descend by setpoints at first (`should_begin_with_setpoints`).
+    enough, descend by setpoints at first (`should_begin_descent_with_setpoints`).
 
     In a tick in which the estimated heading jumps, one setpoint with the new heading is sent
     instead. Under raw thrust, the firmware keeps the heading setpoint that it received last, so it
@@ -461,13 +461,13 @@ def _descend_by_raw_thrust(c: Context) -> Action:
         and c.t_s - descent.heading_setpoint_sent_at_s >= MIN_TIME_BETWEEN_HEADING_SETPOINTS_S
         and all(map(math.isfinite, (*b.telemetry.position_m, b.telemetry.yaw_rad)))
     ):
-        setpoint = limit_setpoint(c, make_setpoint_at_vehicle(c))
+        setpoint = limit_setpoint_to_fence_and_height(c, make_setpoint_at_vehicle(c))
         if setpoint.z_m <= b.telemetry.position_m[2]:
             descent = replace(descent, heading_setpoint_sent_at_s=c.t_s)
             return replace(c.state, descent=descent, setpoint=setpoint), setpoint
     return (
         _descend_by_setpoints(c)
-        if should_begin_with_setpoints(c)
+        if should_begin_descent_with_setpoints(c)
         else descend_level_by_raw_thrust(c)
     )
 
@@ -511,7 +511,7 @@ def _command_onboard_landing(c: Context) -> Action:
         and not state.stop_or_land_command_count
     ):
         return state, away
-    ends = state.stop_or_land_command_count >= MIN_LANDING_COMMAND_COUNT and not (
+    ends = state.stop_or_land_command_count >= MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION and not (
         b.is_position_valid and b.height_m >= MIN_MIDAIR_MOTOR_CUT_HEIGHT_M
     )
     carried = tel.acc_z_g > MAX_SPECIFIC_FORCE_IN_FALL_G or (
@@ -530,7 +530,7 @@ def _command_onboard_landing(c: Context) -> Action:
         else c.t_s - state.last_stop_or_land_command_at_s
     )
     seen = (
-        state.stop_or_land_command_count >= MIN_LANDING_COMMAND_COUNT
+        state.stop_or_land_command_count >= MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION
         and b.is_imu_fresh
         and tel.has_bit(HL_ACTIVE)
     )
@@ -542,7 +542,7 @@ def _command_onboard_landing(c: Context) -> Action:
     if b.height_m < -MIN_DEPTH_BELOW_GROUND_TO_EXTEND_LANDING_M:
         lead_s = ONBOARD_LANDING_EXTENSION_LEAD_S
     elif b.height_m > MIN_HEIGHT_ABOVE_GROUND_TO_EXTEND_LANDING_M:
-        lead_s = LATE_ONBOARD_LANDING_EXTENSION_LEAD_S
+        lead_s = ONBOARD_LANDING_EXTENSION_LEAD_IF_ABOVE_GROUND_S
     extension_count = state.descent.onboard_landing_extension_count
     if (
         seen
@@ -581,7 +581,7 @@ def _command_onboard_landing(c: Context) -> Action:
 def _transfer_weight_to_magnet(c: Context) -> Action:
     """Reduce the thrust until the magnet carries the vehicle, by raw thrust. The telemetry may be
     up to `safety.telemetry_hold_s` old, which is older than in a perch."""
-    return transfer_weight_by_raw_thrust(c, max_telemetry_age_s=c.safety.telemetry_hold_s)
+    return transfer_weight_by_raw_thrust(c, max_stale_telemetry_age_s=c.safety.telemetry_hold_s)
 
 
 def _complete_weight_transfer_to_magnet(c: Context) -> Action:

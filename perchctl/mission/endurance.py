@@ -30,7 +30,7 @@ EXPECTED_TOUCH_DURATION_S = 1.0
 """Time that the touch takes, s, as measured in simulated flights."""
 EXPECTED_LANDING_DURATION_BEYOND_DESCENT_S = 3.0
 """Time that a landing takes in addition to its descent, s, as measured in simulated flights."""
-MAX_VOLTAGE_DIP_BELOW_LIMIT_IN_PRESS_V = 0.3
+MAX_DIP_BELOW_MIN_LOAD_VOLTAGE_IN_PRESS_V = 0.3
 """Largest voltage dip below `safety.min_load_v`, V, during a press that is shorter than the
 debounce time."""
 TRUSTED_HOVER_TIME_FRACTION = 0.7
@@ -58,7 +58,7 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
         hover_time_left_s = hover_times.until_battery_low_s
     if c.belief.target.world_position_m is None:
         return BatteryOutlook(hover_time_left_s, None, consumed_charge_mah, energy.rest_v)
-    predicted = predict_durations(c)
+    predicted = predict_mission_durations(c)
     time_left_s = _time_until_landing_must_begin_s(c, hover_times, predicted.landing_duration_s)
     spare_s = time_left_s - predicted.remaining_attempt_duration_s
     left = c.planner.attempts - c.state.failed_attempts
@@ -95,7 +95,7 @@ def _time_until_landing_must_begin_s(
         by_charge_s = hover_times.until_landing_must_begin_s(landing_duration_s, reserve_s)
         if not _is_battery_reading_missing(c):
             return by_charge_s
-    by_grace_s = _time_left_without_battery_reading_s(c) - landing_duration_s - reserve_s
+    by_grace_s = _time_until_battery_reading_stale_s(c) - landing_duration_s - reserve_s
     return min(by_charge_s, by_grace_s)
 
 
@@ -105,7 +105,7 @@ class HoverTimes:
     and until the voltage in hover falls below `safety.min_load_v`."""
 
     until_battery_low_s: float  # until row `battery-low` lands the vehicle
-    until_min_load_v_s: float  # until the voltage in hover falls below `safety.min_load_v`
+    until_min_load_voltage_s: float  # until the voltage in hover falls below `safety.min_load_v`
 
     def until_landing_must_begin_s(self, landing_duration_s: float, reserve_s: float) -> float:
         """Return the time, s, until a landing that takes `landing_duration_s` must begin: the
@@ -116,7 +116,9 @@ class HoverTimes:
         overdue."""
         return min(
             TRUSTED_HOVER_TIME_FRACTION * self.until_battery_low_s,
-            TRUSTED_HOVER_TIME_FRACTION * self.until_min_load_v_s - landing_duration_s - reserve_s,
+            TRUSTED_HOVER_TIME_FRACTION * self.until_min_load_voltage_s
+            - landing_duration_s
+            - reserve_s,
         )
 
 
@@ -135,7 +137,7 @@ def predict_hover_times(
     `FIRMWARE_LOW_POWER_REPORT_DELAY_S` after the voltage in hover has fallen to the firmware's
     limit; the voltage in hover falls below `safety.min_load_v`; or, in a mission that perches, a
     press would pull the voltage below `safety.min_load_v`. A press that is shorter than the
-    debounce time may pull it lower, by `MAX_VOLTAGE_DIP_BELOW_LIMIT_IN_PRESS_V`.
+    debounce time may pull it lower, by `MAX_DIP_BELOW_MIN_LOAD_VOLTAGE_IN_PRESS_V`.
     """
     if (
         battery_fit.rest_v is None
@@ -148,7 +150,7 @@ def predict_hover_times(
         profile.link.parameters.get("pm.lowVoltage", power_train.low_power_warning_v)
     )
     lasts = EXPECTED_TOUCH_DURATION_S + perch.contact_dwell_s > safety.battery_debounce_s
-    press_v = safety.min_load_v - (0.0 if lasts else MAX_VOLTAGE_DIP_BELOW_LIMIT_IN_PRESS_V)
+    press_v = safety.min_load_v - (0.0 if lasts else MAX_DIP_BELOW_MIN_LOAD_VOLTAGE_IN_PRESS_V)
     press_load = max(hover_thrust_fraction, max_press_thrust(profile) / FULL_THRUST)
     sag_v, discharge_ratio = fit_battery_voltage_model(battery_fit)
     charge_fraction = charge_fraction_from_rest_v(battery_fit.rest_v)
@@ -169,7 +171,7 @@ def predict_hover_times(
     )
     if profile.planner.hover is None:
         battery_low_s = min(battery_low_s, until_s(press_v, press_load))
-    return HoverTimes(until_battery_low_s=battery_low_s, until_min_load_v_s=min_load_v_s)
+    return HoverTimes(until_battery_low_s=battery_low_s, until_min_load_voltage_s=min_load_v_s)
 
 
 @dataclass(frozen=True)
@@ -182,7 +184,7 @@ class MissionDurations:
     landing_duration_s: float
 
 
-def predict_durations(c: Context) -> MissionDurations:
+def predict_mission_durations(c: Context) -> MissionDurations:
     """Predict the times, s, that the rest of this attempt, each retry and the landing take, from
     the target's height, the speeds in the profile, and typical times of the stages without a set
     speed. The position of the target must be known. In a mission that hovers below the target, its
@@ -230,7 +232,7 @@ def is_charge_too_low_for_any_attempt(c: Context) -> bool:
 def battery_shortfall_text(c: Context) -> str:
     """Return a message with the time left for attempts and the times that an attempt, the landing
     and the reserve need."""
-    predicted = predict_durations(c)
+    predicted = predict_mission_durations(c)
     has = "the remaining battery time is unknown"
     if c.state.battery.hover_time_left_s is not None:
         hover_times, landing_s = _predict_hover_times_now(c), predicted.landing_duration_s
@@ -243,7 +245,7 @@ def battery_shortfall_text(c: Context) -> str:
     )
 
 
-def _time_left_without_battery_reading_s(c: Context) -> float:
+def _time_until_battery_reading_stale_s(c: Context) -> float:
     """Return the time, s, until the row `battery-unknown` lands a vehicle that gets no more battery
     readings: `safety.battery_stale_s` minus the time since the last reading."""
     return c.safety.battery_stale_s - max(

@@ -72,7 +72,7 @@ MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS = 0.05
 counts as not sinking, m/s."""
 MIN_COMMANDED_TO_HOVER_THRUST_RATIO = 0.4
 """Smallest commanded thrust, as a fraction of the hover thrust."""
-MIN_TILT_COSINE_DIVIDING_THRUST = 0.8
+MIN_TILT_COSINE_IN_THRUST_COMPENSATION = 0.8
 """Smallest cosine of the tilt for which the thrust is compensated."""
 BRAKE_TILT_GAIN_RAD_PER_MPS = 0.25
 """Tilt per lateral speed, rad per m/s."""
@@ -98,7 +98,7 @@ MAX_VISUAL_ATTITUDE_BIAS_AGE_S = 6.0
 """Time after which the attitude error that pictures have shown no longer applies, s."""
 MIN_SPECIFIC_FORCE_IF_SUPPORTED_G = 0.95
 """Above this specific force, g, a vehicle at low thrust must be resting on something."""
-MAX_SUPPORTED_TO_HOVER_THRUST_RATIO = 0.88
+MAX_THRUST_TO_HOVER_RATIO_IF_SUPPORTED = 0.88
 """Largest thrust at which a vehicle that reads 1 g must be resting on something, as a fraction of
 the hover thrust."""
 MAX_SPECIFIC_FORCE_IF_AIRBORNE_G = 0.85
@@ -128,11 +128,11 @@ MIN_SEEN_GEAR_BELOW_TARGET_IF_DETACHED_M = 0.2
 """Distance of the gear below the target, from pictures with an old attitude, beyond which the
 magnet has let go, m. Larger: the vehicle drifts for longer before it brakes. Smaller: a target seen
 at an angle seems to be above."""
-MAX_THRUST_TO_HOVER_RATIO_IF_SEEN_STANDING = 0.75
+MAX_THRUST_TO_HOVER_RATIO_TO_DETECT_FLOOR_BY_CAMERA = 0.75
 """Fraction of the hover thrust below which a vehicle that does not move in the pictures must be on
 the floor: in the air, it would sink at 1 m/s. Larger: a slow start of the descent looks like the
 floor. Smaller: the motors run on the floor for longer."""
-SEEN_STANDING_DWELL_S = 0.5
+FLOOR_DETECTION_BY_CAMERA_DWELL_S = 0.5
 """Time for which the thrust must have been too low before pictures without motion show the floor,
 s: in the air, the vehicle would sink at 1.2 m/s by then, and pictures show that after a quarter of
 a second. Larger: the motors run on the floor for longer. Smaller: a vehicle that stops climbing
@@ -178,7 +178,7 @@ def _climb_rate_measurement_age_s(c: Context) -> float:
     return max(1e-3, _clamped_time_since_last_tick_s(c), c.t_s - _climb_rate_measured_at_s(c))
 
 
-def should_begin_with_setpoints(c: Context) -> bool:
+def should_begin_descent_with_setpoints(c: Context) -> bool:
     """True if, before the first command of raw thrust, the telemetry is old and the hover thrust is
     not known well enough for a descent by raw thrust; in that case, the vehicle descends by
     setpoints, for at most `MAX_DURATION_OF_DESCENT_BY_SETPOINTS_S`. A climb rate from pictures is
@@ -212,8 +212,8 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
         _climb_rate_measurement_age_s(c),
         _climb_rate_measured_at_s(c),
     )
-    measured_mps = _last_measured_climb_mps(c)
-    climb_mps = measured_mps + descent.climb_rate_change_not_yet_measured_mps
+    measured_climb_mps = _last_measured_climb_mps(c)
+    climb_mps = measured_climb_mps + descent.climb_rate_change_not_yet_measured_mps
     may_be_held, ramp_per_s = (
         climb_mps > -MIN_SINK_RATE_DETECTED_BY_TELEMETRY_MPS,
         THRUST_RAMP_DOWN_RATE_HOVER_FRACTION_PER_S,
@@ -224,7 +224,7 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
     # the climb would let it fall.
     if _visual_motion_if_telemetry_old(c) is not None:
         may_be_held, ramp_per_s = (
-            abs(measured_mps) < MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS,
+            abs(measured_climb_mps) < MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS,
             CAMERA_GUIDED_RAMP_DOWN_HOVER_FRACTION_PER_S,
         )
     hover_thrust = hover.estimate_hover_thrust(b).thrust
@@ -236,8 +236,10 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
     # Since the first command that is too weak, not since the last one that was not: while the loop
     # stands still, the vehicle keeps the thrust that it received last.
     begins = descent.last_commanded_raw_thrust == 0.0
-    too_weak_since_s = math.inf if begins else descent.too_weak_to_fly_since_s
-    floor_detected_at_s = _find_floor_detection_time_s(c, height_m, measured_mps, too_weak_since_s)
+    thrust_too_low_to_fly_since_s = math.inf if begins else descent.thrust_too_low_to_fly_since_s
+    floor_detected_at_s = _find_floor_detection_time_s(
+        c, height_m, measured_climb_mps, thrust_too_low_to_fly_since_s
+    )
     touched_s = math.inf if floor_detected_at_s is None else c.t_s - floor_detected_at_s
     # In the air, the accelerometer reading is proportional to the thrust; on the floor, it is 1 g.
     falls = b.is_imu_fresh and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover_thrust)
@@ -247,7 +249,7 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
     carried = (
         b.is_imu_fresh
         and tel.acc_z_g > MIN_SPECIFIC_FORCE_IF_SUPPORTED_G
-        and tel.thrust < MAX_SUPPORTED_TO_HOVER_THRUST_RATIO * hover_thrust
+        and tel.thrust < MAX_THRUST_TO_HOVER_RATIO_IF_SUPPORTED * hover_thrust
     )
     overdue = _is_touchdown_overdue(c) and not (
         b.is_imu_fresh and tel.acc_z_g < MAX_SPECIFIC_FORCE_IF_AIRBORNE_G
@@ -269,14 +271,16 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
         descent.climb_rate_change_not_yet_measured_mps * max(0.0, 1.0 - shown_s / age_s)
         + gained_mps
     )
-    supports = thrust >= MAX_THRUST_TO_HOVER_RATIO_IF_SEEN_STANDING * hover_thrust
+    supports = thrust >= MAX_THRUST_TO_HOVER_RATIO_TO_DETECT_FLOOR_BY_CAMERA * hover_thrust
     state = _forget_contact_after_fall(c)
     state = replace(
         state,
         descent=replace(
             descent,
             last_commanded_raw_thrust=thrust,
-            too_weak_to_fly_since_s=math.inf if supports else min(c.t_s, too_weak_since_s),
+            thrust_too_low_to_fly_since_s=math.inf
+            if supports
+            else min(c.t_s, thrust_too_low_to_fly_since_s),
             floor_detected_at_s=floor_detected_at_s,
             climb_rate_change_not_yet_measured_mps=climb_rate_change_not_yet_measured_mps,
             climb_rate_measured_at_s=measured_s,
@@ -303,15 +307,16 @@ def _last_measured_climb_mps(c: Context) -> float:
 
 
 def _find_floor_detection_time_s(
-    c: Context, height_m: float, measured_mps: float, too_weak_since_s: float
+    c: Context, height_m: float, measured_climb_mps: float, thrust_too_low_to_fly_since_s: float
 ) -> float | None:
     """Return the time at which the floor was first detected; None if it was not.
 
     The floor is detected by an impact from below while the vehicle was sinking and its height above
     the ground (`height_m`) was less than `MAX_FLOOR_IMPACT_HEIGHT_M`; or by pictures in which the
-    vehicle does not sink (`measured_mps`), clearly below the target, although its thrust has been
-    too low to support it since `too_weak_since_s`, for at least `SEEN_STANDING_DWELL_S`. A shorter
-    time is not enough: a small thrust also brakes a climb.
+    vehicle does not sink (`measured_climb_mps`), clearly below the target, although its thrust has
+    been too low to support it since `thrust_too_low_to_fly_since_s`, for at least
+    `FLOOR_DETECTION_BY_CAMERA_DWELL_S`. A shorter time is not enough: a small thrust also brakes a
+    climb.
     """
     descent, b, seen = c.state.descent, c.belief, _visual_motion_if_telemetry_old(c)
     if descent.floor_detected_at_s is not None:
@@ -323,8 +328,8 @@ def _find_floor_detection_time_s(
     stands = (
         seen is not None
         and seen.gear_to_target_level_m[2] > MIN_SEEN_GEAR_BELOW_TARGET_IF_DETACHED_M
-        and c.t_s - too_weak_since_s >= SEEN_STANDING_DWELL_S
-        and measured_mps > -MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS
+        and c.t_s - thrust_too_low_to_fly_since_s >= FLOOR_DETECTION_BY_CAMERA_DWELL_S
+        and measured_climb_mps > -MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS
     )
     return c.t_s if stands or (struck and height_m < MAX_FLOOR_IMPACT_HEIGHT_M) else None
 
@@ -340,7 +345,7 @@ def _compute_thrust_for_sink_rate(
     but no measurement shows yet. The sink rate setpoint s, m/s, is smaller below
     `MAX_NEAR_FLOOR_HEIGHT_M`, or if `height_m` (above the ground) may be wrong, or if the climb
     rate comes from pictures. The gain k falls with the age of the measured climb rate. The cosine
-    is at least `MIN_TILT_COSINE_DIVIDING_THRUST`.
+    is at least `MIN_TILT_COSINE_IN_THRUST_COMPENSATION`.
     """
     b = c.belief
     # Late pictures, and positions that have diverged, may place the floor half a metre too low.
@@ -356,7 +361,7 @@ def _compute_thrust_for_sink_rate(
         MIN_SINK_RATE_GAIN_HOVER_THRUST_FRACTION_PER_MPS,
         min(MAX_SINK_RATE_GAIN_HOVER_THRUST_FRACTION_PER_MPS, gain),
     )
-    tilt = max(MIN_TILT_COSINE_DIVIDING_THRUST, math.cos(b.tilt_rad))
+    tilt = max(MIN_TILT_COSINE_IN_THRUST_COMPENSATION, math.cos(b.tilt_rad))
     return hover_thrust * (1.0 - gain * (climb_mps + sink_mps)) / tilt
 
 
@@ -427,7 +432,7 @@ def _compute_braking_roll_pitch_rad(c: Context) -> tuple[float, float]:
     if b.is_heading_lost or b.is_possibly_in_magnet_reach:
         return 0.0, 0.0
     dead_reckoning, yaw_rad = b.dead_reckoning, c.telemetry.yaw_rad
-    x_mps, y_mps, _ = dead_reckoning.velocity_mps
+    x_mps, y_mps, _ = dead_reckoning.velocity_world_mps
     speed_mps = max(1e-6, math.hypot(x_mps, y_mps))
     blind_s = 0.0 if b.dead_reckoning_began_at_s is None else c.t_s - b.dead_reckoning_began_at_s
     visual_age_s = (

@@ -12,7 +12,7 @@ from perchctl.profile import Profile
 from perchctl.values import replace
 
 
-def observe(
+def update_state_with_observation(
     state: PlannerState, obs: Observation, profile: Profile, maneuver: Maneuver
 ) -> PlannerState:
     """Return the planner's state with its belief updated by the observation `obs`; no decision is

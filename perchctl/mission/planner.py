@@ -20,13 +20,13 @@ from perchctl.mission.context import Context
 from perchctl.mission.descent import record_command
 from perchctl.mission.endurance import compute_battery_outlook
 from perchctl.mission.observation import Observation
-from perchctl.mission.observe import observe
+from perchctl.mission.observe import update_state_with_observation
 from perchctl.mission.phase import Phase, Severity
-from perchctl.mission.phases.approach import MIN_HEIGHT_TO_CORRECT_HEIGHT_SETPOINT_M
+from perchctl.mission.phases.approach import MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M
 from perchctl.mission.phases.hover import is_hovering
 from perchctl.mission.setpoints import Action, fly_to, lower_held_setpoint
 from perchctl.mission.state import PhaseEntry, PlannerState
-from perchctl.mission.table import PHASE_CONDITIONS, PHASES, TABLE, first_transition
+from perchctl.mission.table import PHASE_CONDITIONS, PHASES, TABLE, find_first_matching_transition
 from perchctl.mission.transition import Transition
 from perchctl.profile import HoverConfig, Profile
 from perchctl.values import replace
@@ -40,13 +40,14 @@ def step_mission(
     table: tuple[Transition, ...] = TABLE,
 ) -> tuple[PlannerState, Command]:
     """Fly one tick of the mission: update the belief with the observation, enter the phase to which
-    a row of `table` leads, if one applies (`first_transition`), and return the new state with the
-    command of the resulting phase. `state` is None in the first tick, on the ground."""
+    a row of `table` leads, if one applies (`find_first_matching_transition`), and return the new
+    state with the command of the resulting phase. `state` is None in the first tick, on the
+    ground."""
     state = _update_before_decision(
         state or PlannerState.initial_on_ground(obs, profile), obs, profile
     )
     c = Context(state)
-    row = first_transition(c, table)
+    row = find_first_matching_transition(c, table)
     if row is None:
         state = replace(state, waiting_reason="")
     elif row.keeps_mission_in(state.phase):
@@ -68,7 +69,7 @@ def _update_before_decision(
     number of successive frames that measured the target, the errors of a hover, the start times of
     the phases' conditions, the reason for a hold, and the battery outlook."""
     maneuver = PHASES[state.phase].maneuver
-    state = observe(state, obs, profile, maneuver)
+    state = update_state_with_observation(state, obs, profile, maneuver)
     consecutive_target_frames, target = state.consecutive_target_frames, obs.target
     if obs.has_new_frame:
         measured = (
@@ -123,7 +124,7 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
             stop_command=row.stop_command,
         ),
         severity=state.severity.escalate(row.severity),
-        outcome=row.outcome_after(state.outcome),
+        outcome=row.outcome_after_transition(state.outcome),
         condition_start_times_s={},
         failed_attempts=state.failed_attempts + int(row.severity is Severity.BACK_OFF),
         waiting_reason="",
@@ -152,7 +153,7 @@ def act_in_phase(c: Context) -> Action:
     if state.hold_reason and state.setpoint is not None and not leaves:
         corrects_height = (
             state.phase is not Phase.APPROACH
-            or c.belief.height_m > MIN_HEIGHT_TO_CORRECT_HEIGHT_SETPOINT_M
+            or c.belief.height_m > MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M
         )
         return fly_to(c, lower_held_setpoint(c, state.setpoint), corrects_height=corrects_height)
     return PHASES[state.phase].act(c)

@@ -74,7 +74,9 @@ class Event:
         if previous_state is None:
             previous_state = PlannerState.initial_on_ground(obs, profile)
             events.append(
-                cls(obs.t_s, EventKind.PHASE, previous_state.reason, previous_state.phase)
+                cls(
+                    obs.t_s, EventKind.PHASE, previous_state.transition_reason, previous_state.phase
+                )
             )
             if not is_battery_reading(obs.telemetry.battery_v):
                 grace_s = profile.safety.battery_stale_s
@@ -83,7 +85,7 @@ class Event:
         if state.phase is not previous_state.phase:
             entered = (
                 EventKind.PHASE,
-                state.reason,
+                state.transition_reason,
                 state.phase,
                 state.transition_name,
                 state.severity,
@@ -246,7 +248,7 @@ class Tick:
         return self.observation.target
 
     @property
-    def contact(self) -> GearToTargetDistance | None:
+    def gear_to_target_at_contact(self) -> GearToTargetDistance | None:
         """Lateral distance between gear and target at the proven contact, with its standard
         deviation; None in all phases except COMPLETE and PERCHED."""
         is_at_target = self.state.phase in (Phase.COMPLETE, Phase.PERCHED)
@@ -260,15 +262,15 @@ class Tick:
         target, phase = self.target, self.state.phase
         is_shown_unseen = phase.is_before_contact or phase is Phase.LANDING
         is_shown = target is not None and (target.tracked or is_shown_unseen)
-        return target if is_shown and self.contact is None else None
+        return target if is_shown and self.gear_to_target_at_contact is None else None
 
     @property
-    def off_and_below_m(self) -> tuple[float, float] | None:
+    def gear_to_target_lateral_and_up_m(self) -> tuple[float, float] | None:
         """For displays: the lateral distance between gear and target, m, at least 0, and the height
         of the target above the gear, m, positive up. In COMPLETE and PERCHED, these are the
         distances at the proven contact, with a height of 0. None if the distance at the contact is
         unknown, or if there is no estimate that may be shown (`target_to_show`)."""
-        contact, target = self.contact, self.target_to_show
+        contact, target = self.gear_to_target_at_contact, self.target_to_show
         if contact is not None and math.isfinite(contact.sigma_m):
             return contact.distance_xy_m, 0.0
         return None if target is None else (math.hypot(*target.e_m[:2]), float(target.e_m[2]))

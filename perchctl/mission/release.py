@@ -15,7 +15,7 @@ from perchctl.mission.context import Context
 from perchctl.mission.setpoints import (
     Action,
     correct_setpoint,
-    limit_setpoint,
+    limit_setpoint_to_fence_and_height,
     make_setpoint_at_vehicle,
 )
 from perchctl.mission.state import PlannerState
@@ -23,7 +23,7 @@ from perchctl.values import replace
 from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
 
 # --- end of a press ---
-MIN_DISTANCE_BELOW_CONTACT_WHEN_PRESS_ENDED_M = 0.08
+MIN_DISTANCE_BELOW_CONTACT_TO_END_PRESS_M = 0.08
 """Distance below the contact beyond which the vehicle has left it, m."""
 MAX_CLIMB_RATE_WHEN_FALLING_AFTER_PRESS_MPS = -0.3
 """Climb rate below which a vehicle that ends its press is falling, m/s; the setpoint then stays at
@@ -43,18 +43,18 @@ MAX_PRESS_DURATION_FOR_GRADUAL_RELEASE_S = 1.5
 at once instead of in steps: by then, the onboard integrator has wound up, and it unwinds slowly by
 itself. Larger: a press whose contact is proven late, because the thrust was not reported, lasts
 longer than 4 s."""
-MIN_RAW_PRESS_TO_HOLDING_THRUST_RATIO = 0.9
+MIN_RAW_PRESS_TO_HOLD_PROOF_THRUST_RATIO = 0.9
 """The raw thrust of a press is lowered to this fraction of `complete.hold_ratio` times hover
 thrust, the largest thrust that proves that the magnet holds the vehicle (too little to fly)."""
 EXTRA_HANGING_TIME_IF_THRUST_UNCONFIRMED_S = 1.5
 """Additional hang time if the reported thrust does not follow the commanded one, s."""
 
 # --- stop ---
-STOP_COMMAND_COUNT = 5
+MOTOR_STOP_COMMAND_COUNT = 5
 """Number of stop commands: a single lost notify message would lock a hanging vehicle."""
-STOP_COMMAND_PERIOD_S = 0.1
+MOTOR_STOP_COMMAND_PERIOD_S = 0.1
 """Time between stop commands, s."""
-STOP_COMMAND_PERIOD_WHILE_THRUST_REPORTED_S = 0.5
+MOTOR_STOP_COMMAND_PERIOD_WHILE_THRUST_REPORTED_S = 0.5
 """Time after which one more stop command is sent while the telemetry shows thrust, s."""
 
 # --- catch ---
@@ -88,7 +88,7 @@ def end_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
         return state, None
     away_m = z - tel.position_m[2]
     calm = (
-        away_m > MIN_DISTANCE_BELOW_CONTACT_WHEN_PRESS_ENDED_M
+        away_m > MIN_DISTANCE_BELOW_CONTACT_TO_END_PRESS_M
         and not is_thrust_above_hover(c.belief)
         and tel.velocity_mps[2] > MAX_CLIMB_RATE_WHEN_FALLING_AFTER_PRESS_MPS
     )
@@ -96,16 +96,16 @@ def end_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
         return replace(state, must_end_press=False), None
     setpoint_below_vehicle_m = (
         INTEGRATOR_UNWIND_SETPOINT_BELOW_VEHICLE_IN_PRESS_M
-        if away_m < MIN_DISTANCE_BELOW_CONTACT_WHEN_PRESS_ENDED_M
+        if away_m < MIN_DISTANCE_BELOW_CONTACT_TO_END_PRESS_M
         else INTEGRATOR_UNWIND_SETPOINT_BELOW_VEHICLE_IN_AIR_M
     )
     if tel.velocity_mps[2] < MAX_CLIMB_RATE_WHEN_FALLING_AFTER_PRESS_MPS:
         setpoint_below_vehicle_m = 0.0
-    dx, dy = state.lateral_integral_m
+    dx, dy = state.integral_setpoint_shift_xy_m
     setpoint = PositionSetpoint(
         x + dx, y + dy, tel.position_m[2] - setpoint_below_vehicle_m, state.entry.yaw_rad
     )
-    return state, limit_setpoint(c, setpoint)
+    return state, limit_setpoint_to_fence_and_height(c, setpoint)
 
 
 def reduce_press_before_weight_transfer(c: Context) -> Action:
@@ -126,7 +126,7 @@ def reduce_press_before_weight_transfer(c: Context) -> Action:
     if perch.mode == "raw":
         if not b.is_imu_fresh:
             return hold_contact_by_position(c)
-        lowest = MIN_RAW_PRESS_TO_HOLDING_THRUST_RATIO * complete.hold_ratio * b.hover_thrust
+        lowest = MIN_RAW_PRESS_TO_HOLD_PROOF_THRUST_RATIO * complete.hold_ratio * b.hover_thrust
         return state, RawThrust(int(perch.thrust + part * (lowest - perch.thrust)))
     setpoint = state.setpoint or make_setpoint_at_vehicle(c)
     assert b.vehicle_world_z_at_last_contact_m is not None
@@ -138,20 +138,22 @@ def reduce_press_before_weight_transfer(c: Context) -> Action:
     top = state.entry.position_m[2] + perch.press_m + slid_m
     low = b.vehicle_world_z_at_last_contact_m - complete.release_drop_m + slid_m
     setpoint = replace(setpoint, z_m=top + part * (low - top))
-    sent = limit_setpoint(c, correct_setpoint(c, setpoint, corrects_height=False))
+    sent = limit_setpoint_to_fence_and_height(
+        c, correct_setpoint(c, setpoint, corrects_height=False)
+    )
     return replace(state, setpoint=setpoint), sent
 
 
-def transfer_weight_by_raw_thrust(c: Context, *, max_telemetry_age_s: float = 0.0) -> Action:
+def transfer_weight_by_raw_thrust(c: Context, *, max_stale_telemetry_age_s: float = 0.0) -> Action:
     """Perform the second stage of the release: reduce raw thrust until the motors stop turning, and
     command the motor stop once the support has carried the whole weight for long enough.
 
     With telemetry too old to count as evidence, the vehicle is held by position control instead,
     and the stage starts over. Such telemetry is still accepted up to an age of
-    `max_telemetry_age_s`; with 0, it is never accepted.
+    `max_stale_telemetry_age_s`; with 0, it is never accepted.
     """
     complete, state, b = c.planner.complete, c.state, c.belief
-    if not b.is_imu_fresh and b.attitude_age_s > max_telemetry_age_s:
+    if not b.is_imu_fresh and b.attitude_age_s > max_stale_telemetry_age_s:
         return hold_contact_by_position(c)
     weight_transfer_began_at_s = state.weight_transfer_began_at_s
     if weight_transfer_began_at_s is None:
@@ -187,9 +189,9 @@ def hold_contact_by_position(c: Context) -> Action:
     setpoint = PositionSetpoint(
         x, y, z_m + CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_ON_M, tel.yaw_rad
     )
-    return replace(state, setpoint=setpoint, weight_transfer_began_at_s=None), limit_setpoint(
-        c, setpoint
-    )
+    return replace(
+        state, setpoint=setpoint, weight_transfer_began_at_s=None
+    ), limit_setpoint_to_fence_and_height(c, setpoint)
 
 
 def has_thrust_ramped_down(c: Context) -> bool:
@@ -204,7 +206,7 @@ def has_thrust_ramped_down(c: Context) -> bool:
 
 def stop_motors(c: Context) -> Action:
     """Send the stop command, and with it the message that ends high-level setpoints (notify),
-    `STOP_COMMAND_COUNT` times: if a single notify were lost, the firmware's supervisor would
+    `MOTOR_STOP_COMMAND_COUNT` times: if a single notify were lost, the firmware's supervisor would
     lock the hanging vehicle. Send more stop commands while the telemetry shows thrust."""
     state, now_s = c.state, c.t_s
     if state.motor_stop_commanded_at_s is None:
@@ -220,10 +222,11 @@ def stop_motors(c: Context) -> Action:
         else state.motor_stop_commanded_at_s
     )
     still_to_send = (
-        state.stop_or_land_command_count < STOP_COMMAND_COUNT and waited_s >= STOP_COMMAND_PERIOD_S
+        state.stop_or_land_command_count < MOTOR_STOP_COMMAND_COUNT
+        and waited_s >= MOTOR_STOP_COMMAND_PERIOD_S
     )
     if still_to_send or (
-        c.telemetry.thrust >= 1 and waited_s >= STOP_COMMAND_PERIOD_WHILE_THRUST_REPORTED_S
+        c.telemetry.thrust >= 1 and waited_s >= MOTOR_STOP_COMMAND_PERIOD_WHILE_THRUST_REPORTED_S
     ):
         return replace(
             state,
@@ -271,7 +274,7 @@ def catch_falling_vehicle(c: Context) -> Action | None:
             tel.position_m[2] + state.catch_setpoint_height_above_vehicle_m,
             state.entry.yaw_rad,
         )
-        return replace(state, setpoint=setpoint), limit_setpoint(c, setpoint)
+        return replace(state, setpoint=setpoint), limit_setpoint_to_fence_and_height(c, setpoint)
     return None
 
 
@@ -280,7 +283,7 @@ def _braking_setpoint_world_xy_m(c: Context) -> tuple[float, float]:
     shows and the state estimate does not (the difference between the two). The setpoint is behind
     the vehicle, opposite to this velocity, by the velocity (at most `MAX_BRAKED_LATERAL_SPEED_MPS`
     per axis) divided by `ONBOARD_POSITION_GAIN_PER_S`."""
-    tel, reckoned_mps = c.telemetry, c.belief.dead_reckoning.velocity_mps
+    tel, reckoned_mps = c.telemetry, c.belief.dead_reckoning.velocity_world_mps
     missing_mps = (reckoned_mps[i] - tel.velocity_mps[i] for i in range(2))
     x_mps, y_mps = (
         max(-MAX_BRAKED_LATERAL_SPEED_MPS, min(MAX_BRAKED_LATERAL_SPEED_MPS, mps))

@@ -75,8 +75,8 @@ class CameraFindings:
 
     measured_latency_s: float
     latency_sigma_s: float
-    rotation_error_deg: tuple[float, float, float]
-    rotation_sigma_deg: tuple[float, float, float]
+    mount_rotation_from_profile_xyz_deg: tuple[float, float, float]
+    mount_rotation_sigma_xyz_deg: tuple[float, float, float]
     advice: tuple[str, ...] = ()
 
     @classmethod
@@ -108,7 +108,11 @@ class CameraFindings:
                 f"the latency is {found.latency_text}, not {camera.start_latency_s * 1e3:.0f} ms "
                 f"as in the profile: set camera.latency_s to {max(0.0, latency_s):.3f}"
             )
-        turns = zip(found.rotation_error_deg, found.rotation_sigma_deg, strict=True)
+        turns = zip(
+            found.mount_rotation_from_profile_xyz_deg,
+            found.mount_rotation_sigma_xyz_deg,
+            strict=True,
+        )
         if any(
             _is_significant(turn, MIN_REPORTED_ROTATION_ERROR_DEG, sigma) for turn, sigma in turns
         ):
@@ -128,7 +132,9 @@ class CameraFindings:
     def rotation_text(self) -> str:
         """The rotation about x, y and z with 95 % intervals, for example ``0.2 +- 0.6, -0.1 +- 0.6,
         0.4 +- 1.8 deg``."""
-        each = zip(self.rotation_error_deg, self.rotation_sigma_deg, strict=True)
+        each = zip(
+            self.mount_rotation_from_profile_xyz_deg, self.mount_rotation_sigma_xyz_deg, strict=True
+        )
         return (
             ", ".join(
                 f"{turn:.1f} +- {SIGMAS_FOR_95_PERCENT_INTERVAL * sigma:.1f}"
@@ -192,7 +198,7 @@ class FlightReport:
     touchdown: Touchdown | None = None  # touchdown of a vehicle that reached the floor
     hover: HoverReport | None = None  # the newest hover of a mission that hovers
     # one sentence for each watcher detached after an exception
-    detached_watchers: tuple[str, ...] = ()
+    detached_watcher_messages: tuple[str, ...] = ()
 
     @property
     def is_profile_suspect(self) -> bool:
@@ -246,7 +252,7 @@ class FlightReport:
 
 
 @dataclass(frozen=True)
-class RestReport:
+class RestStateReport:
     """Where a vehicle rests once its motors are off (`RestState`: for example on the floor, or
     hanging on the target), and its touchdown if there was one."""
 
@@ -263,9 +269,9 @@ class RestReport:
         return f"{self.state.value}; it {self.touchdown.text}"
 
 
-def report_rest(
+def report_rest_state(
     state: PlannerState, obs: Observation, profile: Profile, min_motors_off_s: float
-) -> RestReport | None:
+) -> RestStateReport | None:
     """Return where the vehicle rests (`RestState`), with its touchdown unless the magnet or another
     object holds it; None until telemetry has shown the motors off for `min_motors_off_s`, in
     seconds. `obs` is the newest observation, with which the belief in `state` is updated first."""
@@ -274,7 +280,7 @@ def report_rest(
         return None
     found = find_rest_state(c)
     hangs = found in (RestState.HANGS, RestState.HELD)
-    return RestReport(found, None if hangs else find_touchdown(c))
+    return RestStateReport(found, None if hangs else find_touchdown(c))
 
 
 def find_touchdown(c: Context) -> Touchdown | None:
@@ -312,4 +318,4 @@ def _flight_end_reason(state: PlannerState, history: tuple[Event, ...]) -> str:
         state.phase is not Phase.ABORTED
         or VehicleDiagnosis.LANDING_UNCONFIRMED in state.entry.diagnosis
     )
-    return f"{why}; {state.reason}" if told else state.reason
+    return f"{why}; {state.transition_reason}" if told else state.transition_reason

@@ -46,7 +46,7 @@ def find_rest_state(c: Context) -> RestState:
     recorded contact and is too high to rest on the floor; otherwise, it is on the floor. Without
     such a position, it is on the floor if a tracked target is far above; otherwise, the falls
     measured since it came within the magnet's reach decide
-    (`_find_rest_state_from_falls`). After a restart of the vehicle, its estimate starts
+    (`_find_rest_state_from_measured_falls`). After a restart of the vehicle, its estimate starts
     again at the origin, so neither its earlier position nor a target that was last seen before the
     restart proves anything.
     """
@@ -56,13 +56,20 @@ def find_rest_state(c: Context) -> RestState:
     restarted_at_s = b.imu.vehicle_restarted_at_s
     if b.is_target_position_source or not b.is_position_valid or restarted_at_s > -math.inf:
         is_seen = b.target.is_tracked and b.dead_reckoning.last_sighting_at_s >= restarted_at_s
-        if is_seen and b.target.is_far_above:
+        if is_seen and b.target.is_too_far_above_to_hold_vehicle:
             return RestState.STANDS
-        return _find_rest_state_from_falls(c)
+        return _find_rest_state_from_measured_falls(c)
     high = state.entry.position_m[2] - b.ground_z_m > MIN_HEIGHT_TO_INFER_HANGING_M
     came_down_m = state.entry.position_m[2] - b.telemetry.position_m[2]
-    stayed = high and not b.target.is_far_above and came_down_m < MAX_HEIGHT_LOSS_IF_STILL_HANGING_M
-    at_contact = b.vehicle_world_z_at_last_contact_m is not None and not b.target.is_far_above
+    stayed = (
+        high
+        and not b.target.is_too_far_above_to_hold_vehicle
+        and came_down_m < MAX_HEIGHT_LOSS_IF_STILL_HANGING_M
+    )
+    at_contact = (
+        b.vehicle_world_z_at_last_contact_m is not None
+        and not b.target.is_too_far_above_to_hold_vehicle
+    )
     if stayed or (b.height_m > MAX_HEIGHT_RESTING_ON_FLOOR_M and at_contact):
         return RestState.HANGS
     return RestState.STANDS
@@ -95,7 +102,7 @@ def _is_held_by_other_object(c: Context) -> bool:
     return below and (b.target.is_fresh or by_position)
 
 
-def _find_rest_state_from_falls(c: Context) -> RestState:
+def _find_rest_state_from_measured_falls(c: Context) -> RestState:
     """Return the rest state from the falls that the accelerometer has measured since the vehicle
     came within the magnet's reach. The state is UNKNOWN after a gap in the telemetry that was long
     enough for the vehicle to fall, or to be caught by the magnet, unnoticed."""
@@ -129,7 +136,7 @@ def is_still_hanging(c: Context) -> bool:
     hanging if it is not sinking faster than `complete.slip_mps` and is at most
     `MAX_HEIGHT_DRIFT_BELOW_CONTACT_IF_HANGING_M` below its contact. Failing that, it is hanging if
     the accelerometer has measured no fall since it came within the magnet's reach and no gap can
-    hide one (`_find_rest_state_from_falls`).
+    hide one (`_find_rest_state_from_measured_falls`).
     """
     b, tel = c.belief, c.telemetry
     if (
@@ -144,7 +151,7 @@ def is_still_hanging(c: Context) -> bool:
             <= MAX_HEIGHT_DRIFT_BELOW_CONTACT_IF_HANGING_M
         ):
             return True
-    return _find_rest_state_from_falls(c) is RestState.HANGS
+    return _find_rest_state_from_measured_falls(c) is RestState.HANGS
 
 
 def is_hanging_with_motors_off(c: Context) -> bool:

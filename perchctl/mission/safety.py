@@ -44,7 +44,7 @@ from perchctl.mission.phase import (
     Phase,
     VehicleDiagnosis,
 )
-from perchctl.mission.phases.ascend import NEAR_STANDOFF_HEIGHT
+from perchctl.mission.phases.ascend import ASCENT_END_HEIGHT_REACHED
 from perchctl.mission.rest import is_hanging_with_motors_off
 from perchctl.mission.transition import (
     Transition,
@@ -58,21 +58,21 @@ from perchctl.vehicle import CRASHED, LOCKED, TUMBLED
 
 LIFTOFF_HEIGHT_M = 0.05
 """Height below which the lateral limit of a take-off is
-`MAX_LATERAL_MOTION_BEFORE_LIFTOFF_M`, m."""
-MAX_LATERAL_MOTION_BEFORE_LIFTOFF_M = 0.12
+`MAX_LATERAL_DISTANCE_FROM_SETPOINT_BEFORE_LIFTOFF_M`, m."""
+MAX_LATERAL_DISTANCE_FROM_SETPOINT_BEFORE_LIFTOFF_M = 0.12
 """Largest lateral motion of the vehicle before it has lifted off, m. Larger: a wrong mounting tips
 it over."""
-MAX_HEIGHT_FOR_TIGHTER_DEVIATION_LIMIT_M = 0.3
+MAX_HEIGHT_TO_COUNT_AS_NEAR_FLOOR_M = 0.3
 """Height below which positions in the wrong axes may lead the vehicle into the floor, m."""
-MAX_LATERAL_DISTANCE_FROM_SETPOINT_IF_LOW_M = 0.22
+MAX_LATERAL_DISTANCE_FROM_SETPOINT_NEAR_FLOOR_M = 0.22
 """Lateral distance from the setpoint at which positions have diverged, m, below
-`MAX_HEIGHT_FOR_TIGHTER_DEVIATION_LIMIT_M` and in a vertical climb."""
-MAX_LATERAL_DISTANCE_FROM_SETPOINT_LANDING_M = 0.4
+`MAX_HEIGHT_TO_COUNT_AS_NEAR_FLOOR_M` and in a vertical climb."""
+MAX_LATERAL_DISTANCE_FROM_SETPOINT_IN_LANDING_M = 0.4
 """Lateral distance from the setpoint at which positions have diverged during a landing, m."""
 MAX_LATERAL_DISTANCE_FROM_SETPOINT_M = 0.8
 """Lateral distance from the setpoint at which positions have diverged in all other cases, m:
 further than any draught moves the vehicle. Larger: the vehicle reaches the walls."""
-SETPOINT_DISTANCE_LIMIT_PER_LATENCY_SIGMA_MPS = 4.0
+SETPOINT_DISTANCE_LIMIT_INCREASE_PER_LATENCY_SIGMA_MPS = 4.0
 """How much the limit on the lateral distance from the setpoint increases with the uncertainty of
 the camera latency, m per second of its standard deviation, if the target is the position source.
 Pictures that arrive 0.1 s later than assumed displace the vehicle by up to 0.2 m. Larger: a rotated
@@ -83,20 +83,20 @@ ESTIMATE_CONTRADICTS_IMU_DWELL_S = 0.1
 """Time for which the estimate must contradict the accelerometer, s."""
 MIN_SINK_RATE_IN_OSCILLATION_MPS = 0.5
 """Sink rate that only an oscillation of position control reaches, m/s."""
-MIN_EXCESS_CLIMB_RATE_IN_OSCILLATION_MPS = 0.35
+MIN_CLIMB_RATE_ABOVE_ASCENT_SPEED_IN_OSCILLATION_MPS = 0.35
 """If the climb rate exceeds `ascend.speed_mps`, the setpoint's climb rate in an ascent, by more
 than this value, m/s, position control must be oscillating; in flights with prompt positions, the
 difference is 0.1. Larger: the vehicle strikes the target. Smaller: a gust ends the flight."""
 TARGET_BELOW_VEHICLE_DWELL_S = 0.3
 """Time for which the target must appear below the vehicle, s."""
-SLOW_HOVER_DWELL_S = 2.0
+SLOW_AT_NEARLY_FULL_THRUST_DWELL_S = 2.0
 """Time at nearly full thrust after which a hovering vehicle counts as having too little thrust, s.
 Larger: it sinks to the floor from a greater height. Smaller: a gust makes a weak vehicle land."""
-NOT_CLIMBING_DWELL_S = 2.0
+NOT_CLIMBING_AT_FULL_THRUST_DWELL_S = 2.0
 """Time at full thrust after which a vehicle that does not climb has too little thrust for a press,
 or is pressing against something, s. Larger: it presses for longer. Smaller: a gust makes a weak
 vehicle land."""
-SLOW_TAKEOFF_DWELL_S = 1.0
+SLOW_TAKEOFF_AT_NEARLY_FULL_THRUST_DWELL_S = 1.0
 """Time at full thrust after which a vehicle that takes off too slowly cannot fly, s; the weakest
 vehicles that can perch reach full thrust for up to 0.4 s. Larger: the vehicle sinks to the floor
 from a greater height. Smaller: a weak vehicle that can perch lands."""
@@ -105,10 +105,10 @@ HELD_BY_OTHER_OBJECT_DWELL_S = 2.0
 MAX_VELOCITY_VARIANCE_WITHOUT_SIGHTING_M2PS2 = 0.02
 """Variance of the estimated velocity above which a stale position counts as lost, (m/s)^2; it is
 reached about 3 s after the last sighting."""
-MIN_SIGHTING_TO_WRONG_ESTIMATE_DISTANCE_M = 0.3
+MIN_SIGHTING_TO_ESTIMATE_DISTANCE_IF_ESTIMATE_WRONG_M = 0.3
 """Distance of the newest sighting from the estimate beyond which the estimate is wrong, m. Larger:
 position control moves the vehicle further away. Smaller: an oscillation ends the flight."""
-MIN_POSITION_AGE_TO_BELIEVE_SIGHTINGS_S = 0.35
+MIN_POSITION_AGE_TO_TRUST_REJECTED_SIGHTINGS_S = 0.35
 """Age of the newest position, including the latency, at which contradicting sightings can no longer
 be a single mistake, s. Larger: position control diverges for longer. Smaller: one wrong detection
 ends the flight."""
@@ -138,15 +138,19 @@ def is_position_control_diverging(c: Context) -> bool:
         )
         return (
             not touched
-            and _lateral_distance_from_setpoint_m(c) > MAX_LATERAL_DISTANCE_FROM_SETPOINT_LANDING_M
+            and _lateral_distance_from_setpoint_m(c)
+            > MAX_LATERAL_DISTANCE_FROM_SETPOINT_IN_LANDING_M
         )
     spare_m = (
-        SETPOINT_DISTANCE_LIMIT_PER_LATENCY_SIGMA_MPS * c.obs.camera_latency_sigma_s
+        SETPOINT_DISTANCE_LIMIT_INCREASE_PER_LATENCY_SIGMA_MPS * c.obs.camera_latency_sigma_s
         if b.is_target_position_source
         else 0.0
     )
     if phase is Phase.APPROACH and b.height_m < LIFTOFF_HEIGHT_M:
-        return _lateral_distance_from_setpoint_m(c) > MAX_LATERAL_MOTION_BEFORE_LIFTOFF_M + spare_m
+        return (
+            _lateral_distance_from_setpoint_m(c)
+            > MAX_LATERAL_DISTANCE_FROM_SETPOINT_BEFORE_LIFTOFF_M + spare_m
+        )
     ground = b.takeoff_position_m
     above_start = ground is not None and (
         math.hypot(setpoint.x_m - ground[0], setpoint.y_m - ground[1])
@@ -156,9 +160,9 @@ def is_position_control_diverging(c: Context) -> bool:
     is_pushed = (
         b.imu.t_s - b.imu.last_lateral_push_at_s <= MAX_PUSH_TO_ESTIMATE_RESPONSE_DELAY_S
     )  # by moving air
-    stays = b.height_m < MAX_HEIGHT_FOR_TIGHTER_DEVIATION_LIMIT_M or (only_climbs and not is_pushed)
+    stays = b.height_m < MAX_HEIGHT_TO_COUNT_AS_NEAR_FLOOR_M or (only_climbs and not is_pushed)
     return _lateral_distance_from_setpoint_m(c) > (
-        MAX_LATERAL_DISTANCE_FROM_SETPOINT_IF_LOW_M + spare_m
+        MAX_LATERAL_DISTANCE_FROM_SETPOINT_NEAR_FLOOR_M + spare_m
         if stays
         else MAX_LATERAL_DISTANCE_FROM_SETPOINT_M
     )
@@ -167,7 +171,7 @@ def is_position_control_diverging(c: Context) -> bool:
 def _is_oscillating_vertically(c: Context) -> bool:
     moves = c.state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.HOVER)
     by_capture = c.profile.positioning.source.is_mocap
-    most_mps = c.planner.ascend.speed_mps + MIN_EXCESS_CLIMB_RATE_IN_OSCILLATION_MPS
+    most_mps = c.planner.ascend.speed_mps + MIN_CLIMB_RATE_ABOVE_ASCENT_SPEED_IN_OSCILLATION_MPS
     return (
         moves
         and by_capture
@@ -180,7 +184,7 @@ def _lateral_distance_from_setpoint_m(c: Context) -> float:
     return 0.0 if setpoint is None else math.hypot(x_m - setpoint.x_m, y_m - setpoint.y_m)
 
 
-def divergence_reason(c: Context) -> str:
+def position_control_divergence_reason(c: Context) -> str:
     """Return a message that says how position control diverges (vertical oscillation, distance from
     the setpoint, or a velocity that contradicts the accelerometer), and the possible causes."""
     b = c.belief
@@ -213,9 +217,9 @@ def is_position_lost(c: Context) -> bool:
     if b.position_correction_age_s > c.profile.positioning.land_s or b.is_estimate_missing_gust:
         return True
     if (
-        b.position_correction_age_s > MIN_POSITION_AGE_TO_BELIEVE_SIGHTINGS_S
+        b.position_correction_age_s > MIN_POSITION_AGE_TO_TRUST_REJECTED_SIGHTINGS_S
         and c.obs.rejected_sighting_to_estimate_distance_m
-        > MIN_SIGHTING_TO_WRONG_ESTIMATE_DISTANCE_M
+        > MIN_SIGHTING_TO_ESTIMATE_DISTANCE_IF_ESTIMATE_WRONG_M
     ):
         return True
     unsure = b.max_axis_velocity_variance_m2ps2 > MAX_VELOCITY_VARIANCE_WITHOUT_SIGHTING_M2PS2
@@ -305,14 +309,14 @@ def is_held_by_target(c: Context) -> bool:
     something is holding the vehicle, and this support is the target's magnet. A press with a proven
     contact is not necessary: the magnet may catch the vehicle earlier."""
     hangs = c.true_for_s(HANGING) >= HANGING_CONFIRMATION_DWELL_S
-    return hangs and c.support is Support.MAGNET
+    return hangs and c.vehicle_support is Support.MAGNET
 
 
 def is_held_by_other_object(c: Context) -> bool:
     """True if something has held the vehicle for `HELD_BY_OTHER_OBJECT_DWELL_S`, and the vehicle is
     certainly away from the target's height or from its axis."""
     hangs = c.true_for_s(HANGING) >= HELD_BY_OTHER_OBJECT_DWELL_S
-    return hangs and c.support is Support.HELD_BY_OTHER_OBJECT
+    return hangs and c.vehicle_support is Support.HELD_BY_OTHER_OBJECT
 
 
 def is_climb_blocked(c: Context) -> bool:
@@ -332,15 +336,15 @@ def is_climb_blocked_off_target(c: Context) -> bool:
 
 def is_thrust_insufficient_for_takeoff(c: Context) -> bool:
     """True if the vehicle has climbed too slowly at nearly full thrust for
-    `SLOW_TAKEOFF_DWELL_S`, to be used during the take-off. Such a vehicle
+    `SLOW_TAKEOFF_AT_NEARLY_FULL_THRUST_DWELL_S`, to be used during the take-off. Such a vehicle
     rises only in the ground effect or on a freshly charged battery, and would soon sink back."""
-    return c.true_for_s(SLOW_AT_NEARLY_FULL_THRUST) >= SLOW_TAKEOFF_DWELL_S
+    return c.true_for_s(SLOW_AT_NEARLY_FULL_THRUST) >= SLOW_TAKEOFF_AT_NEARLY_FULL_THRUST_DWELL_S
 
 
-def is_thrust_insufficient(c: Context) -> bool:
+def is_thrust_insufficient_to_fly_or_press(c: Context) -> bool:
     """True if too little thrust remains to keep flying or to press, as measured or as predicted.
-    Measured: the vehicle has not climbed at full thrust for `NOT_CLIMBING_DWELL_S`,
-    or has hardly climbed at nearly full thrust for `SLOW_HOVER_DWELL_S`. In an
+    Measured: the vehicle has not climbed at full thrust for `NOT_CLIMBING_AT_FULL_THRUST_DWELL_S`,
+    or has hardly climbed at nearly full thrust for `SLOW_AT_NEARLY_FULL_THRUST_DWELL_S`. In an
     ascent, only the first counts, since a weak vehicle that can perch climbs the last part slowly.
     Predicted, at the stand-off before the press: hover thrust exceeds
     `MIN_SATURATED_TO_FULL_THRUST_RATIO` times the largest press thrust.
@@ -351,18 +355,21 @@ def is_thrust_insufficient(c: Context) -> bool:
     if c.state.must_end_press:
         return False
     ascends = c.state.phase is Phase.ASCEND
-    if c.true_for_s(NOT_CLIMBING_AT_FULL_THRUST) >= NOT_CLIMBING_DWELL_S:
+    if c.true_for_s(NOT_CLIMBING_AT_FULL_THRUST) >= NOT_CLIMBING_AT_FULL_THRUST_DWELL_S:
         return True
-    if not ascends and c.true_for_s(SLOW_AT_NEARLY_FULL_THRUST) >= SLOW_HOVER_DWELL_S:
+    if (
+        not ascends
+        and c.true_for_s(SLOW_AT_NEARLY_FULL_THRUST) >= SLOW_AT_NEARLY_FULL_THRUST_DWELL_S
+    ):
         return True
-    near = ascends and c.true_for_s(NEAR_STANDOFF_HEIGHT) >= 0.0
+    near = ascends and c.true_for_s(ASCENT_END_HEIGHT_REACHED) >= 0.0
     near = near and c.planner.hover is None
     return near and c.belief.hover_thrust > MIN_SATURATED_TO_FULL_THRUST_RATIO * max_press_thrust(
         c.profile
     )
 
 
-def _outcome_after_supervisor_lock(previous_outcome: Outcome | None) -> Outcome:
+def _outcome_if_locked_while_hanging(previous_outcome: Outcome | None) -> Outcome:
     """Return the outcome if the supervisor has locked a hanging vehicle. HOVERED becomes SAFETY,
     since a hover must end on the floor; any other outcome is kept; without an outcome, the result
     is PERCHED."""
@@ -394,7 +401,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         lambda c: c.telemetry.has_bit(LOCKED) and is_hanging_with_motors_off(c),
         Phase.PERCHED,
         "hanging, but the supervisor has locked the vehicle: restart it before the next flight",
-        outcome=_outcome_after_supervisor_lock,
+        outcome=_outcome_if_locked_while_hanging,
     ),
     supervisor_abort_row(
         "locked", LOCKED, "the supervisor has locked the vehicle: inspect and restart it"
@@ -440,7 +447,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         "position-astray",
         FREE_AIR_PHASES | {Phase.LANDING},
         is_position_control_diverging,
-        divergence_reason,
+        position_control_divergence_reason,
         diagnosis=VehicleDiagnosis.EXTERNAL_POSITIONS_WRONG | VehicleDiagnosis.PROFILE_MAY_BE_WRONG,
     ),
     land_row(
@@ -581,7 +588,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "too-weak",
         CAMERA_GUIDED_PHASES,
-        is_thrust_insufficient,
+        is_thrust_insufficient_to_fly_or_press,
         "hovering needs all of the thrust: the vehicle is too heavy, the battery too low, or an "
         "obstacle is above",
     ),

@@ -73,7 +73,7 @@ MAX_LATERAL_SPEED_WITH_UNCONFIRMED_CAMERA_MOUNTING_MPS = 0.25
 rotated camera leads the vehicle further off course."""
 HELD_SETPOINT_SINK_RATE_WITHOUT_SIGHTING_MPS = 0.2
 """Sink rate commanded during a hold while the camera does not see the target, m/s."""
-MIN_HELD_SETPOINT_HEIGHT_M = 0.3
+MIN_HELD_SETPOINT_HEIGHT_ABOVE_GROUND_M = 0.3
 """Height above the ground at which a held setpoint stops sinking, m."""
 
 
@@ -83,7 +83,7 @@ def make_setpoint_at_vehicle(c: Context) -> PositionSetpoint:
     return PositionSetpoint(x, y, z, c.telemetry.yaw_rad)
 
 
-def body_world_xy_under_target(c: Context, yaw_rad: float) -> tuple[float, float]:
+def vehicle_world_xy_with_gear_under_target_m(c: Context, yaw_rad: float) -> tuple[float, float]:
     """Return the world x and y (m) of the body at which its gear is below the target, for the
     heading `yaw_rad` of the vehicle. The target's position must be known."""
     target = c.belief.target.world_position_m
@@ -97,7 +97,7 @@ def make_setpoint_under_target(c: Context, vehicle_world_z_m: float) -> Position
     `vehicle_world_z_m`, with the target's heading. The target's position must be known."""
     yaw = c.belief.target.world_yaw_rad
     assert yaw is not None
-    x, y = body_world_xy_under_target(c, yaw)
+    x, y = vehicle_world_xy_with_gear_under_target_m(c, yaw)
     return PositionSetpoint(x, y, vehicle_world_z_m, yaw)
 
 
@@ -144,7 +144,7 @@ def fly_to(c: Context, reference: PositionSetpoint, *, corrects_height: bool = T
     """Store the setpoint `reference`, where the vehicle should be, and send a setpoint that brings
     it there in spite of wind and onboard control errors (`correct_setpoint`). Without
     `corrects_height`, the height sent is that of `reference`."""
-    return replace(c.state, setpoint=reference), limit_setpoint(
+    return replace(c.state, setpoint=reference), limit_setpoint_to_fence_and_height(
         c, correct_setpoint(c, reference, corrects_height=corrects_height)
     )
 
@@ -154,8 +154,10 @@ def fly_under_target(c: Context, vehicle_world_z_m: float, *, max_up_mps: float 
     integral that keeps the gear there. The setpoint climbs at no more than `max_up_mps`; by
     default, it does not climb."""
     goal = make_setpoint_under_target(c, vehicle_world_z_m)
-    lateral_integral_m = update_lateral_integral(c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s)
-    c = Context(replace(c.state, lateral_integral_m=lateral_integral_m))
+    integral_setpoint_shift_xy_m = update_lateral_integral(
+        c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s
+    )
+    c = Context(replace(c.state, integral_setpoint_shift_xy_m=integral_setpoint_shift_xy_m))
     old = c.state.setpoint or make_setpoint_at_vehicle(c)
     return fly_to(
         c,
@@ -166,9 +168,9 @@ def fly_under_target(c: Context, vehicle_world_z_m: float, *, max_up_mps: float 
 
 
 def update_lateral_integral(
-    c: Context, goal_xy_m: tuple[float, float], dt_s: float
+    c: Context, goal_world_xy_m: tuple[float, float], dt_s: float
 ) -> tuple[float, float]:
-    """Return the integral (x, y) over time of the lateral position error to `goal_xy_m`,
+    """Return the integral (x, y) over time of the lateral position error to `goal_world_xy_m`,
     times the gain `integral_per_s`: a shift of the setpoint, m, world axes, that removes the offset
     which a steady wind leaves.
 
@@ -176,9 +178,9 @@ def update_lateral_integral(
     accumulates, and the integral may become large, only while the vehicle hovers in place.
     """
     planner = c.planner
-    ex = goal_xy_m[0] - c.telemetry.position_m[0]
-    ey = goal_xy_m[1] - c.telemetry.position_m[1]
-    tx, ty = c.state.lateral_integral_m
+    ex = goal_world_xy_m[0] - c.telemetry.position_m[0]
+    ey = goal_world_xy_m[1] - c.telemetry.position_m[1]
+    tx, ty = c.state.integral_setpoint_shift_xy_m
     stands = c.belief.speed_mps < MAX_SPEED_TO_COUNT_AS_HOVERING_MPS
     most_m = (
         MAX_LATERAL_INTEGRAL_SHIFT_M
@@ -201,14 +203,14 @@ def move_setpoint_to_vehicle(c: Context) -> PlannerState:
     """
     reference, (x_m, y_m, _) = c.state.setpoint, c.telemetry.position_m
     if reference is None or c.belief.is_position_diverged:
-        return replace(c.state, lateral_integral_m=(0.0, 0.0))
+        return replace(c.state, integral_setpoint_shift_xy_m=(0.0, 0.0))
     if not c.belief.is_position_valid or c.belief.speed_mps > MAX_SPEED_TO_COUNT_AS_HOVERING_MPS:
         return c.state
     sent = correct_setpoint(c, reference)
     return replace(
         c.state,
         setpoint=replace(reference, x_m=x_m, y_m=y_m),
-        lateral_integral_m=limit_vector_length(
+        integral_setpoint_shift_xy_m=limit_vector_length(
             sent.x_m - x_m, sent.y_m - y_m, MAX_LATERAL_INTEGRAL_SHIFT_M
         ),
     )
@@ -225,7 +227,7 @@ def correct_setpoint(
 ) -> PositionSetpoint:
     """Return the setpoint to send so that the vehicle reaches `reference` in spite of wind and
     onboard control errors: the reference plus the lateral integral, the lateral feedback
-    (`_lateral_feedback_shift`), and a height correction of at most
+    (`_lateral_feedback_shift_world_xy_m`), and a height correction of at most
     `MAX_HEIGHT_CORRECTION_M` from the height error and the vertical speed (world axes, m; the
     module docstring has the equations). If `corrects_height` is False, the height is that of the
     reference."""
@@ -239,16 +241,18 @@ def correct_setpoint(
         if corrects_height
         else 0.0
     )
-    dx, dy = _lateral_feedback_shift(c, reference)
+    dx, dy = _lateral_feedback_shift_world_xy_m(c, reference)
     return replace(
         reference,
-        x_m=reference.x_m + c.state.lateral_integral_m[0] + dx,
-        y_m=reference.y_m + c.state.lateral_integral_m[1] + dy,
+        x_m=reference.x_m + c.state.integral_setpoint_shift_xy_m[0] + dx,
+        y_m=reference.y_m + c.state.integral_setpoint_shift_xy_m[1] + dy,
         z_m=reference.z_m + lifted,
     )
 
 
-def _lateral_feedback_shift(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
+def _lateral_feedback_shift_world_xy_m(
+    c: Context, reference: PositionSetpoint
+) -> tuple[float, float]:
     """Return the shift (x, y) of the setpoint, m, world axes, that adds feedback of lateral
     position, velocity and tilt to the feedback of the onboard controllers; zero far from the target
     or with old telemetry."""
@@ -261,7 +265,7 @@ def _lateral_feedback_shift(c: Context, reference: PositionSetpoint) -> tuple[fl
     gain = max(0.0, min(1.0, near, prompt))
     if gain == 0.0:
         return 0.0, 0.0
-    (error_x_m, error_y_m), (vx_mps, vy_mps) = _lateral_error_and_velocity(c, reference)
+    (error_x_m, error_y_m), (vx_mps, vy_mps) = _lateral_error_and_velocity_world_xy(c, reference)
     ax_mps2, ay_mps2 = c.belief.acceleration_from_tilt_world_xy_mps2
     dx = (
         LATERAL_ERROR_GAIN * error_x_m
@@ -279,7 +283,7 @@ def _lateral_feedback_shift(c: Context, reference: PositionSetpoint) -> tuple[fl
     return part * dx, part * dy
 
 
-def _lateral_error_and_velocity(
+def _lateral_error_and_velocity_world_xy(
     c: Context, reference: PositionSetpoint
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the vector from the vehicle to `reference`, m, and the vehicle's velocity, m/s, both
@@ -297,7 +301,7 @@ def _lateral_error_and_velocity(
         return (reference.x_m - x_m, reference.y_m - y_m), c.belief.velocity_mps[:2]
     # The reference may still be on its way to the target. The offset applies to the gear at the
     # vehicle's present heading, and the reference's heading may differ.
-    x_m, y_m = body_world_xy_under_target(c, tel.yaw_rad)
+    x_m, y_m = vehicle_world_xy_with_gear_under_target_m(c, tel.yaw_rad)
     return (
         reference.x_m - x_m + lateral.gear_to_target_world_xy_m[0],
         reference.y_m - y_m + lateral.gear_to_target_world_xy_m[1],
@@ -308,19 +312,19 @@ def lower_held_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpo
     """Return `setpoint`, which the vehicle holds, one tick later. If the target is the position
     source and the position is stale because the target is out of view, the setpoint sinks at
     `HELD_SETPOINT_SINK_RATE_WITHOUT_SIGHTING_MPS`, down to
-    `MIN_HELD_SETPOINT_HEIGHT_M` above the ground, to bring the target back into view.
+    `MIN_HELD_SETPOINT_HEIGHT_ABOVE_GROUND_M` above the ground, to bring the target back into view.
     Otherwise, it is unchanged."""
     b = c.belief
     if not (b.is_target_position_source and b.is_position_stale) or b.takeoff_position_m is None:
         return setpoint
-    lowest_m = min(setpoint.z_m, b.takeoff_position_m[2] + MIN_HELD_SETPOINT_HEIGHT_M)
+    lowest_m = min(setpoint.z_m, b.takeoff_position_m[2] + MIN_HELD_SETPOINT_HEIGHT_ABOVE_GROUND_M)
     z_m = setpoint.z_m - HELD_SETPOINT_SINK_RATE_WITHOUT_SIGHTING_MPS * max(
         0.0, c.t_s - c.state.t_s
     )
     return replace(setpoint, z_m=max(lowest_m, z_m))
 
 
-def limit_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
+def limit_setpoint_to_fence_and_height(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     """Return the setpoint moved inside the fence, below the height limit, and at least
     `MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M` above the ground; in a take-off, at least at the ground.
     The setpoint is unchanged while the take-off position is unknown."""

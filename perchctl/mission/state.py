@@ -42,7 +42,7 @@ class DescentState:
     """
 
     last_commanded_raw_thrust: float = 0.0
-    too_weak_to_fly_since_s: float = math.inf
+    thrust_too_low_to_fly_since_s: float = math.inf
     climb_rate_measured_at_s: float = -math.inf  # time of the newest sample at the last tick
     # climb rate that recent commands cause and no sample shows yet
     climb_rate_change_not_yet_measured_mps: float = 0.0
@@ -136,7 +136,7 @@ class PlannerState:
     searched_position_count: int = 0
     search_step_began_at_s: float = 0.0
     setpoint: PositionSetpoint | None = None
-    lateral_integral_m: tuple[float, float] = (0.0, 0.0)
+    integral_setpoint_shift_xy_m: tuple[float, float] = (0.0, 0.0)
     #: the phase began with the vehicle pressed at high thrust, and the press has not ended yet
     must_end_press: bool = False
     catch_setpoint_height_above_vehicle_m: float | None = None
@@ -161,7 +161,7 @@ class PlannerState:
         return self.entry.transition_name
 
     @property
-    def reason(self) -> str:
+    def transition_reason(self) -> str:
         """Why the phase was entered, in words."""
         return self.entry.reason
 
@@ -185,7 +185,7 @@ class PlannerState:
             maneuver=maneuver,
             maneuver_start_position_m=self.entry.position_m,
             setpoint=self.setpoint,
-            raw_thrust=self.commanded_raw_thrust,
+            commanded_raw_thrust=self.commanded_raw_thrust,
             weight_transfer_began_at_s=self.weight_transfer_began_at_s,
             motor_stop_commanded_at_s=self.motor_stop_commanded_at_s,
             floor_detected_at_s=self.descent.floor_detected_at_s,

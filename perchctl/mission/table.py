@@ -54,11 +54,13 @@ EXIT_ROWS: tuple[Transition, ...] = tuple(row for phase in PHASES.values() for r
 """The phases' own rows, in the order of `PHASES`."""
 TABLE: tuple[Transition, ...] = (*SAFETY_ROWS, *EXIT_ROWS)
 """The built-in table: safety rows first, then the exits of the phases."""
-PHASE_CONDITIONS = tuple(each for phase in PHASES.values() for each in phase.conditions)
+PHASE_CONDITIONS = tuple(each for phase in PHASES.values() for each in phase.timed_conditions)
 """The phases' own conditions; `update_belief` updates those of the belief."""
 
 
-def first_transition(c: Context, table: tuple[Transition, ...] = TABLE) -> Transition | None:
+def find_first_matching_transition(
+    c: Context, table: tuple[Transition, ...] = TABLE
+) -> Transition | None:
     """Return the first row of `table` that applies: the present phase is one of its phases, and its
     `when` is true. Return None if no row applies, and the mission stays in its phase. Once the
     mission is landing, rows to a phase before the landing are skipped.
@@ -83,7 +85,7 @@ def first_transition(c: Context, table: tuple[Transition, ...] = TABLE) -> Trans
 # --- Your own rows ---
 
 
-TRANSITIONS_ALLOWED_FOR_OWN_ROWS = frozenset(
+TRANSITIONS_ALLOWED_FOR_USER_ROWS = frozenset(
     (phase, row.to, row.severity)
     for row in TABLE
     for phase in row.phases & PRE_CONTACT_PHASES - {row.to}
@@ -101,22 +103,22 @@ def add_rows(
     exits of the phases.
 
     A row of your own may wait in ALIGN, or lead to an earlier phase, to RECOVER or to LANDING
-    (`TRANSITIONS_ALLOWED_FOR_OWN_ROWS`). Your own rows do not apply in COMPLETE and LANDING.
+    (`TRANSITIONS_ALLOWED_FOR_USER_ROWS`). Your own rows do not apply in COMPLETE and LANDING.
     Raises InvalidValue for a row that is not allowed, is not a valid `Transition`, or has a name
     that is taken. If a function of a row raises in flight, InvalidValue names the row, and the
     vehicle lands.
     """
     names, own = {row.name for row in table}, list[Transition]()
     for row in rows if isinstance(rows, Iterable) else (rows,):
-        _check_types(row)
+        _check_row_types(row)
         if row.name in names:
             raise InvalidValue(f"row {row.name!r}: another row has that name; rename it")
         names.add(row.name)
         for phase in row.phases:
-            if (phase, row.to, row.severity) not in TRANSITIONS_ALLOWED_FOR_OWN_ROWS:
+            if (phase, row.to, row.severity) not in TRANSITIONS_ALLOWED_FOR_USER_ROWS:
                 may = sorted(
                     f"{to.name} ({how.name})"
-                    for at, to, how in TRANSITIONS_ALLOWED_FOR_OWN_ROWS
+                    for at, to, how in TRANSITIONS_ALLOWED_FOR_USER_ROWS
                     if at is phase
                 )
                 raise InvalidValue(
@@ -127,8 +129,8 @@ def add_rows(
             raise InvalidValue(f"row {row.name!r} must not set stop_command, outcome or diagnosis")
         outcome = Outcome.SAFETY if row.to is Phase.LANDING else None
         when, reason = (
-            _wrap_row_function(row.name, row.when),
-            _wrap_row_function(row.name, row.reason_text),
+            _wrap_errors_with_row_name(row.name, row.when),
+            _wrap_errors_with_row_name(row.name, row.reason_text),
         )
         phases = frozenset(row.phases)  # an immutable copy, so that it cannot change in flight
         own.append(replace(row, phases=phases, when=when, reason=reason, outcome=outcome))
@@ -136,7 +138,7 @@ def add_rows(
     return (*table[:at], *own, *table[at:])
 
 
-def _check_types(row: object) -> None:
+def _check_row_types(row: object) -> None:
     """Raise InvalidValue unless `row` is a `Transition` whose fields have the right types."""
     if not (
         isinstance(row, Transition)
@@ -154,18 +156,18 @@ def _check_types(row: object) -> None:
         )
 
 
-def _wrap_row_function(
-    name: str, function: Callable[[Context], Returned]
+def _wrap_errors_with_row_name(
+    row_name: str, function: Callable[[Context], Returned]
 ) -> Callable[[Context], Returned]:
     """Return a function that calls `function` and, if that raises an exception, raises InvalidValue
     with the row's name instead. `function` is the `when` or `reason` of your own row called
-    `name`."""
+    `row_name`."""
 
     def call(c: Context) -> Returned:
         try:
             return function(c)
         except Exception as error:
-            raise InvalidValue(f"your own row {name!r} raised {error_at(error)}") from error
+            raise InvalidValue(f"your own row {row_name!r} raised {error_at(error)}") from error
 
     return call
 

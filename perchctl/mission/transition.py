@@ -45,7 +45,7 @@ class Transition:
         """Return the reason in words; a `reason` that is a function is called with `c`."""
         return self.reason if isinstance(self.reason, str) else self.reason(c)
 
-    def outcome_after(self, previous_outcome: Outcome | None) -> Outcome | None:
+    def outcome_after_transition(self, previous_outcome: Outcome | None) -> Outcome | None:
         """Return the flight's outcome after this transition: `previous_outcome` if the row has no
         outcome of its own. None means that no outcome has been decided."""
         if self.outcome is None or isinstance(self.outcome, Outcome):

@@ -153,7 +153,7 @@ def tick_record(
         "t_s": tick.t_s,
         "phase": tick.state.phase.value,
         "stage": None if seen is None else seen.stage.value,
-        "reason": tick.state.reason,
+        "reason": tick.state.transition_reason,
         "hold": tick.state.pause_reason or None,
         "attempts": tick.state.failed_attempts,
         "tel_age_s": tick.telemetry_age_s,

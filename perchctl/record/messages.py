@@ -44,7 +44,7 @@ SETPOINT_KEYS = ("cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad")
 
 def image_message(time_ns: int, frame: Frame) -> CompressedImage:
     """Return the message for an image: the camera's own JPEG, or else a PNG."""
-    data = frame.encoded
+    data = frame.source_jpeg
     if data is None:
         png = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1]
         data = png.tobytes()

@@ -112,10 +112,10 @@ class Recorder:
     def write_frame(self, frame: Frame) -> None:
         """Record a frame from the source. Never raises an exception."""
         self._hand_over()  # in flight, `write_tick` does this; before take-off, there are no ticks
-        self._pictures += not frame.repeated
+        self._pictures += not frame.is_repeated
         self._turn.append(partial(self._write_frame, frame))
         # A repeated frame also contains its image.
-        self._turn_bytes += frame.image.nbytes + len(frame.encoded or b"")
+        self._turn_bytes += frame.image.nbytes + len(frame.source_jpeg or b"")
 
     def write_tick(self, record: Mapping[str, Any]) -> None:
         """Record a tick (`perchctl.record.fields.tick_record`), which ends a turn. Never raises an
@@ -165,10 +165,10 @@ class Recorder:
             "number": frame.index,
             "t_s": frame.t_s,
             "t_arrival_s": frame.t_arrival_s,
-            "repeated": frame.repeated,
+            "repeated": frame.is_repeated,
         }
         self._newest_s, ns = frame.t_arrival_s, self._ns(frame.t_arrival_s)
-        if not frame.repeated:
+        if not frame.is_repeated:
             self._add(IMAGE, ns, image_message(self._ns(frame.t_s), frame), number)
             self._written_pictures += 1
         # The times are not rounded, because a replay needs them exactly.

@@ -16,7 +16,7 @@ from perchctl.geometry import R_MARKER_TARGET, Array, rot_z
 from perchctl.profile import Mounting, Profile, TargetConfig
 from perchctl.vision import (
     CameraModel,
-    shows_enough_of_target,
+    can_fit_truncated_target,
     square_corners,
     undistort_to_normalised,
 )
@@ -265,7 +265,9 @@ def blind_range(target: TargetConfig, camera: CameraModel, profile: Profile) -> 
 
     def left(range_m: float) -> bool:
         centre = R @ np.array([0.0, 0.0, range_m]) + offset
-        return whole(range_m) or shows_enough_of_target(R @ R_MARKER_TARGET, centre, target, camera)
+        return whole(range_m) or can_fit_truncated_target(
+            R @ R_MARKER_TARGET, centre, target, camera
+        )
 
     return BlindRange(_lost_at_m(whole), _lost_at_m(left))
 

@@ -1,7 +1,7 @@
 from .fields import deinterlace_image as deinterlace_image
 from .lens import project as project
 from .lens import undistort_to_normalised as undistort_to_normalised
-from .markers.cut import shows_enough_of_target as shows_enough_of_target
+from .markers.cut import can_fit_truncated_target as can_fit_truncated_target
 from .markers.edge_fit import refine_corners_by_lines as refine_corners_by_lines
 from .pipeline import Detector as Detector
 from .pipeline import Pipeline as Pipeline

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.values import replace
-from perchctl.vision.types import FieldState, Frame
+from perchctl.vision.types import Frame, InterlacingState
 
 GreyImage = NDArray[np.uint8]
 
@@ -31,11 +31,11 @@ _ROWS_PER_COMBING_GROUP = 8
 _MIN_ROW_DIFFERENCE_TO_MEAN_RATIO = 5.0
 _MIN_ROW_DIFFERENCE_GREY = 8.0
 # Energy per pixel of strong row differences that noise alone may cause.
-_NOISE_FLOOR_GREY2 = 0.25
+_NOISE_ENERGY_PER_PIXEL_GREY2 = 0.25
 _COMBING_CHECK_INTERVAL_FRAMES = 3
 # The position error of a horizontal edge in an interpolated field is the first value times exp(-k
 # s^2), where s is the standard deviation of the blur, px, and k the second value.
-_ALIASING_SIGMA_PX, _ALIASING_DECAY_PER_PX2 = 0.8, 2.45
+_ALIASING_SIGMA_WITHOUT_BLUR_PX, _ALIASING_DECAY_PER_BLUR_PX2 = 0.8, 2.45
 # cubic interpolation at the midpoint
 _INTERPOLATION_TAPS = np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0
 
@@ -45,10 +45,10 @@ _VALID_FRAME_PERIOD_RANGE_S = (0.004, 0.1)
 _MAX_STORED_FRAME_PERIODS = 25
 _MIN_LOST_FRAME_TO_MEDIAN_PERIOD_RATIO = 1.8
 # After a longer gap, s, the previous frame says nothing about the field order.
-_MAX_FRAME_GAP_S = 0.25
+_MAX_FIELD_ORDER_VOTE_GAP_S = 0.25
 # The votes decide the field order if their sum exceeds this value. Each vote is at most 1, so the
 # decision takes at least two frames.
-_MIN_ABS_FIELD_ORDER_VOTE_SUM = 1.0
+_MIN_FIELD_ORDER_DECISION_VOTE_SUM = 1.0
 # The sum is limited to this value so that a change of the field order is detected soon.
 _MAX_ABS_FIELD_ORDER_VOTE_SUM = 3.0
 # A sum above this value reverses an earlier decision.
@@ -80,7 +80,7 @@ def is_combed(image: GreyImage) -> bool:
         for each in (other, own)
     ]
     return (
-        energy[0] / (energy[1] + _NOISE_FLOOR_GREY2 * row.size)
+        energy[0] / (energy[1] + _NOISE_ENERGY_PER_PIXEL_GREY2 * row.size)
         > _MIN_INTER_TO_INTRA_FIELD_ENERGY_RATIO
     )
 
@@ -116,7 +116,9 @@ def interpolated_field_edge_sigma_px(blur_sigma_px: float) -> float:
     interpolated field. It is due to aliasing, because a field only has every second row, and
     becomes smaller as the blur grows. `blur_sigma_px` is the standard deviation of the edge's blur,
     px."""
-    return _ALIASING_SIGMA_PX * math.exp(-_ALIASING_DECAY_PER_PX2 * blur_sigma_px * blur_sigma_px)
+    return _ALIASING_SIGMA_WITHOUT_BLUR_PX * math.exp(
+        -_ALIASING_DECAY_PER_BLUR_PX2 * blur_sigma_px * blur_sigma_px
+    )
 
 
 def classify_interlacing(frame: Frame) -> Frame:
@@ -132,14 +134,18 @@ def interpolate_fields(frame: Frame) -> tuple[Frame, Frame]:
     """Return the top and the bottom field of a woven (interlaced) frame, each interpolated to full
     height. Both have the time of the frame."""
     return (
-        replace(frame, image=interpolate_field(frame.image, 0), picture_kind="top", encoded=None),
         replace(
-            frame, image=interpolate_field(frame.image, 1), picture_kind="bottom", encoded=None
+            frame, image=interpolate_field(frame.image, 0), picture_kind="top", source_jpeg=None
+        ),
+        replace(
+            frame, image=interpolate_field(frame.image, 1), picture_kind="bottom", source_jpeg=None
         ),
     )
 
 
-def deinterlace_frame(state: FieldState, frame: Frame) -> tuple[FieldState, tuple[Frame, ...]]:
+def deinterlace_frame(
+    state: InterlacingState, frame: Frame
+) -> tuple[InterlacingState, tuple[Frame, ...]]:
     """Return the new state and the images to process, in time order: the two fields of a woven
     frame if the order of the fields is known, otherwise the frame itself. The fields' times are a
     quarter of the frame period before and after the frame's time.
@@ -159,7 +165,7 @@ def deinterlace_frame(state: FieldState, frame: Frame) -> tuple[FieldState, tupl
     picture_kind = state.picture_kind if state.picture_kind == "woven" else frame.picture_kind
     frame_periods_s = _update_frame_periods_s(state, frame)
     if frame.picture_kind == "whole":
-        new = FieldState(
+        new = InterlacingState(
             picture_kind,
             skipped,
             state.top_field_first_vote_sum,
@@ -206,7 +212,7 @@ def _estimate_frame_period_s(frame_periods_s: tuple[float, ...]) -> float:
     return period_s
 
 
-def _update_frame_periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
+def _update_frame_periods_s(state: InterlacingState, frame: Frame) -> tuple[float, ...]:
     if state.last_frame_t_s is not None:
         gap_s = frame.t_s - state.last_frame_t_s
         if _VALID_FRAME_PERIOD_RANGE_S[0] < gap_s < _VALID_FRAME_PERIOD_RANGE_S[1]:
@@ -214,7 +220,7 @@ def _update_frame_periods_s(state: FieldState, frame: Frame) -> tuple[float, ...
     return state.frame_periods_s
 
 
-def _vote_on_field_order(state: FieldState, frame: Frame) -> FieldState:
+def _vote_on_field_order(state: InterlacingState, frame: Frame) -> InterlacingState:
     before, top_field_first_vote_sum, is_top_field_first = (
         state.previous_image,
         state.top_field_first_vote_sum,
@@ -222,7 +228,7 @@ def _vote_on_field_order(state: FieldState, frame: Frame) -> FieldState:
     )
     near = (
         state.last_frame_t_s is not None
-        and 0.0 < frame.t_s - state.last_frame_t_s < _MAX_FRAME_GAP_S
+        and 0.0 < frame.t_s - state.last_frame_t_s < _MAX_FIELD_ORDER_VOTE_GAP_S
     )
     if near and before is not None and before.shape == frame.image.shape:
         rows = (len(before) - 2) // 2 * 2
@@ -237,7 +243,10 @@ def _vote_on_field_order(state: FieldState, frame: Frame) -> FieldState:
             max(top_field_first_vote_sum + vote, -_MAX_ABS_FIELD_ORDER_VOTE_SUM),
             _MAX_ABS_FIELD_ORDER_VOTE_SUM,
         )
-    if is_top_field_first is None and abs(top_field_first_vote_sum) > _MIN_ABS_FIELD_ORDER_VOTE_SUM:
+    if (
+        is_top_field_first is None
+        and abs(top_field_first_vote_sum) > _MIN_FIELD_ORDER_DECISION_VOTE_SUM
+    ):
         is_top_field_first = top_field_first_vote_sum > 0.0
     elif (
         is_top_field_first is not None

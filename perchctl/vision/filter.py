@@ -25,10 +25,10 @@ from perchctl.vision.types import MarkerTrack
 
 YAW, YAW_RATE, X, VX, Y, VY, Z, VZ = range(8)
 """Indices of the elements of the state."""
-MEASURED, RATES = slice(YAW, None, 2), slice(YAW_RATE, None, 2)
+MEASURED_ELEMENTS, RATE_ELEMENTS = slice(YAW, None, 2), slice(YAW_RATE, None, 2)
 POSITION, VELOCITY = slice(X, None, 2), slice(VX, None, 2)
 # columns of the biases: the vehicle's roll and pitch, and the print's size and curl
-TILTS, PRINT = slice(0, 2), slice(2, 4)
+TILT_BIASES, PRINT_BIASES = slice(0, 2), slice(2, 4)
 
 MAX_TRACK_GAP_S = 1.0
 """Longest gap between two frames of a track, s; a longer gap ends the track."""
@@ -39,11 +39,11 @@ this limit."""
 _IDENTITY_3: Array = np.eye(3)
 _IDENTITY_8: Array = np.eye(8)
 _RATE_INTEGRATION_MATRIX: Array = np.eye(8, k=1)
-_RATE_INTEGRATION_MATRIX[RATES] = 0.0
+_RATE_INTEGRATION_MATRIX[RATE_ELEMENTS] = 0.0
 
 _M_PER_CM = 0.01
 _RAD_PER_DEG = math.radians(1.0)
-_SI_PER_PAPER_UNIT = np.array(
+_CM_DEG_STATE_TO_SI = np.array(
     [_RAD_PER_DEG, _RAD_PER_DEG, _M_PER_CM, _M_PER_CM, _M_PER_CM, _M_PER_CM, _M_PER_CM, _M_PER_CM]
 )  # SI value of the paper's unit for each element of the state
 
@@ -53,7 +53,7 @@ the variance of the acceleration times this time."""
 _WORLD_FRAME_YAW_XYZ_DRIFT_COV_PER_S = np.diag([math.radians(0.1), 0.005, 0.005, 0.005]) ** 2
 """Variances (rad^2, m^2) of the random walk of the state estimate's yaw, x, y and z within one
 second."""
-_WORLD_FRAME_HEADING_ACCELERATION_SIGMA_RADPS2 = 0.1
+_WORLD_FRAME_TARGET_HEADING_ACCELERATION_SIGMA_RADPS2 = 0.1
 _MAX_NIS_WITHOUT_RESTART = 25.0
 """Limit of the normalized innovation squared (NIS) with four degrees of freedom; by chance, 5 in
 100 000 updates exceed it. Larger: after a lost frame, the track of a camera without a vehicle
@@ -171,21 +171,21 @@ def make_filter_setup(config: KalmanConfig, is_world_frame: bool = False) -> Fil
     measured = config.noise == "measured"
     level_rate = 100.0 if measured else 30.0
     first = np.full(8, config.k1)
-    first[RATES] = (5.0 if is_world_frame else level_rate) ** 2  # cm/s and deg/s
-    squares = _SI_PER_PAPER_UNIT**2
+    first[RATE_ELEMENTS] = (5.0 if is_world_frame else level_rate) ** 2  # cm/s and deg/s
+    squares = _CM_DEG_STATE_TO_SI**2
     acceleration_process_noise = None
     if measured:
         acceleration_process_noise = (
             ProcessNoise(
                 config.drift_mps2,
-                _WORLD_FRAME_HEADING_ACCELERATION_SIGMA_RADPS2,
+                _WORLD_FRAME_TARGET_HEADING_ACCELERATION_SIGMA_RADPS2,
                 is_world_frame_drifting=True,
             )
             if is_world_frame
             else ProcessNoise(config.acceleration_mps2, config.turn_radps2, config.turn_radps2)
         )
     return FilterSetup(
-        R=np.diag(config.k1 * squares[MEASURED]),
+        R=np.diag(config.k1 * squares[MEASURED_ELEMENTS]),
         Q=np.diag(config.k2 * squares),
         P0=np.diag(first * squares),
         velocity_factor_per_unseen_frame=config.alpha,
@@ -227,16 +227,16 @@ def process_noise_covariance(dt_s: float, target_position_m: Array, setup: Filte
     noise = setup.acceleration_process_noise
     if noise is None:
         return setup.Q
-    pushed = _acceleration_covariance(noise, target_position_m) * dt_s
+    pushed = _yaw_xyz_rate_noise_cov_per_s(noise, target_position_m) * dt_s
     # In the state, each value is followed by its rate.
     pair = np.array([[dt_s * dt_s / 3.0, dt_s / 2.0], [dt_s / 2.0, 1.0]])
     Q: Array = (pushed[:, None, :, None] * pair[:, None, :]).reshape(8, 8)
     if noise.is_world_frame_drifting:
-        Q[MEASURED, MEASURED] += _WORLD_FRAME_YAW_XYZ_DRIFT_COV_PER_S * dt_s
+        Q[MEASURED_ELEMENTS, MEASURED_ELEMENTS] += _WORLD_FRAME_YAW_XYZ_DRIFT_COV_PER_S * dt_s
     return Q
 
 
-def _acceleration_covariance(noise: ProcessNoise, target_position_m: Array) -> Array:
+def _yaw_xyz_rate_noise_cov_per_s(noise: ProcessNoise, target_position_m: Array) -> Array:
     """Return the covariance (4, 4) that process noise adds per second to the rates of (yaw, x, y,
     z): rad^2/s^2 for the yaw rate and m^2/s^2 for the velocities, each per second. The axes x, y
     and z are those of the track's frame, the level frame or the world frame.
@@ -266,14 +266,14 @@ def start_track(measurement: TrackMeasurement, t_s: float, setup: FilterSetup) -
     Its covariance is `setup.P0`, with the measurement's own covariance, if it has one, for yaw and
     position."""
     x = np.zeros(8)
-    x[MEASURED] = measurement.z
+    x[MEASURED_ELEMENTS] = measurement.z
     x[YAW] = wrap_rad(float(measurement.z[0]))
     P = setup.P0.copy()
     if measurement.R is not None:
-        P[MEASURED, MEASURED] = measurement.R
+        P[MEASURED_ELEMENTS, MEASURED_ELEMENTS] = measurement.R
     shift_per_bias_sigma = np.zeros((8, 4))
     if measurement.yaw_xyz_shift_per_bias_sigma is not None:
-        shift_per_bias_sigma[MEASURED] = measurement.yaw_xyz_shift_per_bias_sigma
+        shift_per_bias_sigma[MEASURED_ELEMENTS] = measurement.yaw_xyz_shift_per_bias_sigma
     return MarkerTrack(
         t_s=t_s, x=x, P=P, unseen_frames=0, state_shift_per_bias_sigma=shift_per_bias_sigma
     )
@@ -313,23 +313,23 @@ def step_track(
         if track.unseen_frames >= setup.max_unseen_frames:
             return None
         x = track.x.copy()
-        x[RATES] *= setup.velocity_factor_per_unseen_frame  # equation 3
+        x[RATE_ELEMENTS] *= setup.velocity_factor_per_unseen_frame  # equation 3
         return _predict_from_state(track, x, dt_s, t_s, track.unseen_frames + 1, setup)
     F, Q = transition_matrix(dt_s), process_noise_covariance(dt_s, track.x[POSITION], setup)
     x, P = _import_filterpy_predict()(track.x, track.P, F=F, Q=Q)
     R = setup.R if measurement.R is None else measurement.R
     if setup.max_nis_without_restart < math.inf:
-        off, S = _innovation(x, measurement.z), P[MEASURED, MEASURED] + R
+        off, S = _innovation(x, measurement.z), P[MEASURED_ELEMENTS, MEASURED_ELEMENTS] + R
         regular, solved = cv2.solve(S, off[:, None], flags=cv2.DECOMP_CHOLESKY)
         if regular and off.dot(solved)[0] > setup.max_nis_without_restart:
             begun = start_track(measurement, t_s, setup)
-            begun.P[MEASURED, MEASURED] += np.outer(off, off)
+            begun.P[MEASURED_ELEMENTS, MEASURED_ELEMENTS] += np.outer(off, off)
             return begun
     x, P, gain = _kalman_update(x, P, measurement.z, R)
     shift_per_bias_sigma = F.dot(track.state_shift_per_bias_sigma)
     if measurement.yaw_xyz_shift_per_bias_sigma is not None:
         shift_per_bias_sigma += gain.dot(
-            measurement.yaw_xyz_shift_per_bias_sigma - shift_per_bias_sigma[MEASURED]
+            measurement.yaw_xyz_shift_per_bias_sigma - shift_per_bias_sigma[MEASURED_ELEMENTS]
         )
     return MarkerTrack(
         t_s=t_s, x=x, P=P, unseen_frames=0, state_shift_per_bias_sigma=shift_per_bias_sigma
@@ -339,7 +339,7 @@ def step_track(
 def _innovation(x: Array, z: Array) -> Array:
     """Return the innovation (4,) of (yaw, x, y, z), rad and m: the measurement `z` (4,) minus the
     prediction in the state `x` (8,), with the yaw difference wrapped."""
-    off = z - x[MEASURED]
+    off = z - x[MEASURED_ELEMENTS]
     off[0] = wrap_rad(float(off[0]))
     return off
 
@@ -350,14 +350,16 @@ def _kalman_update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array
     z), (4,), with covariance `R` (4, 4). If the innovation's covariance is not positive definite,
     the measurement is ignored and the gain is 0."""
     off = _innovation(x, z)
-    regular, solved = cv2.solve(P[MEASURED, MEASURED] + R, P[MEASURED], flags=cv2.DECOMP_CHOLESKY)
+    regular, solved = cv2.solve(
+        P[MEASURED_ELEMENTS, MEASURED_ELEMENTS] + R, P[MEASURED_ELEMENTS], flags=cv2.DECOMP_CHOLESKY
+    )
     if not regular:  # S is not positive definite, so the measurement is ignored
         return x, P, np.zeros((8, 4))
     gain = np.asarray(solved.T, dtype=np.float64)
     x = x + gain.dot(off)
     x[YAW] = wrap_rad(float(x[YAW]))
     left = _IDENTITY_8.copy()
-    left[:, MEASURED] -= gain
+    left[:, MEASURED_ELEMENTS] -= gain
     return x, left.dot(P).dot(left.T) + gain.dot(R).dot(gain.T), gain
 
 

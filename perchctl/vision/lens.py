@@ -37,10 +37,10 @@ def undistort_to_normalised(points_px: Array, camera: CameraModel) -> Array:
 def undistort_px(points_px: Array, camera: CameraModel) -> Array:
     """Convert pixels (n, 2) of the distorted image to pixels (n, 2) of an undistorted image, taken
     by a pinhole camera with the same `K`."""
-    return pinhole_px(undistort_to_normalised(points_px, camera), camera)
+    return normalised_to_pinhole_px(undistort_to_normalised(points_px, camera), camera)
 
 
-def pinhole_px(points_normalised: Array, camera: CameraModel) -> Array:
+def normalised_to_pinhole_px(points_normalised: Array, camera: CameraModel) -> Array:
     """Convert normalised coordinates (n, 2), x/z and y/z in the camera frame, to pixels (n, 2) of a
     pinhole camera with the camera's `K`."""
     K = camera.K

@@ -190,7 +190,7 @@ def widen_covariance_for_rival(merged: MergedTarget, rival_state: Array) -> Merg
 READOUT_TIME_SIGMA_IF_UNKNOWN_S = 0.012
 """Standard deviation of a camera's rolling-shutter readout time, s, if the profile does not specify
 it."""
-FLOW_ALONG_SIGMA_FRACTION, FLOW_ACROSS_SIGMA_FRACTION = 0.05, 0.015
+CORNER_FLOW_SIGMA_FRACTION_ALONG, CORNER_FLOW_SIGMA_FRACTION_ACROSS = 0.05, 0.015
 """Errors of a corner's motion along and across its direction, as fractions of the motion. They
 arise because the motion was measured one frame earlier."""
 
@@ -225,7 +225,7 @@ def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[De
         if readout_s is None:
             out.append(replace(d, corner_shift_per_readout_sigma_px=moved_px))
         else:
-            turned_px = FLOW_ACROSS_SIGMA_FRACTION * float(np.abs(moved_px).max())
+            turned_px = CORNER_FLOW_SIGMA_FRACTION_ACROSS * float(np.abs(moved_px).max())
             cov_px2 = None if d.cov_px2 is None else d.cov_px2 + turned_px**2 * np.eye(8)
             out.append(
                 replace(
@@ -233,7 +233,7 @@ def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[De
                     corners_px=d.corners_px - moved_px,
                     sigma_px=float(np.hypot(d.sigma_px, turned_px)),
                     cov_px2=cov_px2,
-                    corner_shift_per_readout_sigma_px=FLOW_ALONG_SIGMA_FRACTION * moved_px,
+                    corner_shift_per_readout_sigma_px=CORNER_FLOW_SIGMA_FRACTION_ALONG * moved_px,
                 )
             )
     return out

@@ -174,8 +174,8 @@ def deinterlace(
     InvalidValue for the same reasons as `step`."""
     with one_thread():
         frame = _convert_to_grey(frame, pipeline.camera)
-        fields, found = deinterlace_frame(state.field_state, frame)
-    return replace(state, field_state=fields), found
+        fields, found = deinterlace_frame(state.interlacing_state, frame)
+    return replace(state, interlacing_state=fields), found
 
 
 def step(
@@ -215,7 +215,7 @@ def step(
                 empty,
                 measure_marker_to_own_target_distance_m,
             )
-    return step_detections(
+    return step_from_detections(
         state, detections, attitude, pipeline, start_pose, frame.picture_kind or "whole"
     )
 
@@ -225,7 +225,7 @@ def _convert_to_grey(frame: Frame, camera: CameraModel) -> Frame:
     have the camera's size."""
     grey, size_px = to_grey(frame.image), camera.size_px
     if grey is not frame.image:
-        frame = replace(frame, image=grey, encoded=None)
+        frame = replace(frame, image=grey, source_jpeg=None)
     height, width = grey.shape
     if (width, height) != size_px:
         raise InvalidValue(
@@ -257,7 +257,7 @@ def _run_custom_detector(frame: Frame, detect: Detector) -> Detections:
     return Detections(frame.index, frame.t_s, found.get("large"), found.get("small"))
 
 
-def step_detections(
+def step_from_detections(
     state: PipelineState,
     detections: Detections,
     attitude: VehicleState | None,
@@ -311,7 +311,7 @@ def step_detections(
         frames_without_markers=0 if anything else state.frames_without_markers + 1,
         lock=tracked_frame.lock,
         rival=tracked_frame.rival,
-        field_state=state.field_state,
+        interlacing_state=state.interlacing_state,
     )
     output = PipelineOutput(
         detections=detections,

@@ -28,9 +28,9 @@ _TILT_FROM_ATTITUDE_SIGMA_RAD = math.radians(6.0)
 _TILT_FROM_PREVIOUS_POSE_SIGMA_RAD = math.radians(10.0)
 # If the corners of both markers on a flat sheet have a larger chi-squared per degree of freedom,
 # the sheet may be curled.
-_MIN_SHEET_CURL_CHI2_PER_DOF = 3.0
+_MIN_CHI2_PER_DOF_FOR_SHEET_CURL = 3.0
 # If curl is the cause, at most this fraction of chi-squared remains after allowing for it.
-_MAX_CHI2_FRACTION_WITH_SHEET_CURL = 0.5
+_MAX_REMAINING_CHI2_FRACTION_WITH_SHEET_CURL = 0.5
 _PoseSource = Literal["large", "small", "joint"]
 
 
@@ -49,7 +49,7 @@ class PoseSetup:
     readout_s: float | None = 0.0
 
     @cached_property
-    def corners_m(self) -> dict[_PoseSource, Array]:
+    def marker_corners_m(self) -> dict[_PoseSource, Array]:
         """Corners (4, 3) of each marker, m, in its own axes: x right and y up on the paper, z out
         of it. The order is top left, top right, bottom right, bottom left. ``joint`` (8, 3)
         contains the corners of the large marker, then those of the small one."""
@@ -65,7 +65,7 @@ class PoseSetup:
         curl = self.target.curl_per_m
         return {
             source: corner_lift_by_sheet_curl(corners, curl)
-            for source, corners in self.corners_m.items()
+            for source, corners in self.marker_corners_m.items()
         }
 
 
@@ -110,7 +110,9 @@ def estimate_pose(
     if not is_finite(image_points_px):
         return None  # the lens model has no solution for these corners
     K, lift = setup.camera.K, setup.corner_lift_per_sheet_curl_sigma_m[source]
-    points = compute_corner_weights(detections, setup.corners_m[source], image_points_px, K, lift)
+    points = compute_corner_weights(
+        detections, setup.marker_corners_m[source], image_points_px, K, lift
+    )
     R_level_body = R_level_body_of(attitude)
     if attitude is not None:
         R_level_cam = R_level_body.dot(setup.T_body_cam[:3, :3])
@@ -126,7 +128,7 @@ def estimate_pose(
     pose = _make_marker_pose(source, t_s, solution, points, R_level_body, setup)
     if (
         source != "joint"
-        or pose.chi2_per_dof < _MIN_SHEET_CURL_CHI2_PER_DOF
+        or pose.chi2_per_dof < _MIN_CHI2_PER_DOF_FOR_SHEET_CURL
         or setup.target.curl_per_m == 0.0
     ):
         return pose
@@ -141,7 +143,7 @@ def estimate_pose(
     bent = _make_marker_pose(source, t_s, settled, points, R_level_body, setup)
     return (
         replace(bent, chi2_per_dof=pose.chi2_per_dof)
-        if bent.chi2_per_dof < _MAX_CHI2_FRACTION_WITH_SHEET_CURL * pose.chi2_per_dof
+        if bent.chi2_per_dof < _MAX_REMAINING_CHI2_FRACTION_WITH_SHEET_CURL * pose.chi2_per_dof
         else pose
     )
 
@@ -181,7 +183,7 @@ def _make_marker_pose(
     R_level_target = R_level_cam.dot(R).dot(R_MARKER_TARGET)
     G = np.zeros((4, 6))  # derivative of (e, e_yaw) with respect to (rvec, tvec)
     G[:3, 3:] = R_level_cam
-    G[3, :3] = _yaw_gradient(R_level_cam, R_level_target, dR_drvec)
+    G[3, :3] = _yaw_gradient_wrt_rvec(R_level_cam, R_level_target, dR_drvec)
     cov_e = G.dot(cov).dot(G.T)
     # If the print is larger by some percentage, the target is actually further away by the same
     # percentage.
@@ -235,7 +237,7 @@ def target_normal_cam(pose: MarkerPose) -> Array:
     return np.asarray(cv2.Rodrigues(pose.rvec_rad)[0][:, 2])
 
 
-def _yaw_gradient(R_level_cam: Array, R_level_target: Array, dR_drvec: Array) -> Array:
+def _yaw_gradient_wrt_rvec(R_level_cam: Array, R_level_target: Array, dR_drvec: Array) -> Array:
     """Return the gradient (3,) of the target's yaw in the level frame with respect to the rotation
     vector. The yaw is atan2(R[1, 0], R[0, 0]) with R = `R_level_target` (3, 3). `R_level_cam` (3,
     3) rotates from camera to level axes. `dR_drvec` (3, 9) is the derivative of the rotation matrix
@@ -260,7 +262,7 @@ _CORNER_SIGMA_PRIOR_DOF = 8.0
 
 # A step is small enough for the errors to be linear if it reduces the cost by less than the first
 # value and changes each element of the pose, in rad or m, by less than the second one.
-_MIN_COST_GAIN, _MIN_POSE_STEP = 1.0, 0.005
+_MAX_LINEARISED_COST_REDUCTION, _MAX_LINEARISED_STEP_RAD_OR_M = 1.0, 0.005
 # A larger reduction is also allowed if no corner moves further than this. The nonlinearity is about
 # the squared motion divided by the distance between corners, which is 20 px or more.
 _MAX_LINEARISED_MOTION_PX = 0.3
@@ -345,7 +347,7 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
         A, error = W.dot(scored.reprojection_jacobian), W.dot(scored.reprojection_error_px.ravel())
         B, weighed = A, error
         if points.allows_for_sheet_curl:
-            weight = sheet_curl_weight_matrix(_whitened_sheet_curl_shift(points, scored))
+            weight = sheet_curl_weight_matrix(_whitened_shift_per_sheet_curl_sigma(points, scored))
             B, weighed = weight @ A, weight @ error
         cost = float(error.dot(weighed))
         if cost > before * (1.0 + 1e-6) + 1e-9 or not math.isfinite(cost):
@@ -359,8 +361,11 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
         # Reduction of the cost by this step, in squared standard deviations.
         gain = float(step.dot(g))
         moved_px = scored.reprojection_jacobian.dot(step).reshape(-1, 2)
-        small = gain < _MIN_COST_GAIN or float(np.abs(moved_px).max()) < _MAX_LINEARISED_MOTION_PX
-        if small and max(map(abs, step.tolist())) < _MIN_POSE_STEP:
+        small = (
+            gain < _MAX_LINEARISED_COST_REDUCTION
+            or float(np.abs(moved_px).max()) < _MAX_LINEARISED_MOTION_PX
+        )
+        if small and max(map(abs, step.tolist())) < _MAX_LINEARISED_STEP_RAD_OR_M:
             # The errors are linear for a step of this size.
             reprojection_error_px = scored.reprojection_error_px - moved_px
             rvec, tvec = scored.rvec_rad - step[:3], scored.tvec_m - step[3:]
@@ -398,7 +403,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
     W = points.whitening_matrix
     A, error = W.dot(scored.reprojection_jacobian), W.dot(scored.reprojection_error_px.ravel())
     freedom = len(error) - 6
-    curl = _whitened_sheet_curl_shift(points, scored)
+    curl = _whitened_shift_per_sheet_curl_sigma(points, scored)
     weight = sheet_curl_weight_matrix(curl) if points.allows_for_sheet_curl else None
     B, weighed = (A, error) if weight is None else (weight @ A, weight @ error)
     regular, inverse = cv2.invert(B.T.dot(A), flags=cv2.DECOMP_CHOLESKY)
@@ -416,7 +421,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
     return PoseCovariance(cov, chi2 / freedom, curled)
 
 
-def _whitened_sheet_curl_shift(points: WeightedCorners, scored: ScoredPose) -> Array:
+def _whitened_shift_per_sheet_curl_sigma(points: WeightedCorners, scored: ScoredPose) -> Array:
     """Return the shift (2n, 2) of the whitened reprojection errors of `points` at the pose `scored`
     for one standard deviation of each mode of the sheet's curl (`corner_lift_by_sheet_curl`). If
     curl lifts a corner off the sheet's plane, its image moves as if the whole target moved along
@@ -548,7 +553,7 @@ def sheet_curl_weight_matrix(whitened_shift_per_sheet_curl_sigma: Array) -> Arra
 
 
 _IDENTITY_8 = np.eye(8)
-_TILT_TO_OFFSET_WHITENING_RATIO = np.array(1.0 / math.sqrt(3.0))
+_LINE_TILT_TO_OFFSET_WHITENING_RATIO = np.array(1.0 / math.sqrt(3.0))
 _PREVIOUS_CORNER_INDICES = np.array([3, 0, 1, 2])
 # Side k runs from corner k to corner k + 1.
 _SIDE_START_CORNER_INDICES = np.arange(4)
@@ -703,5 +708,5 @@ def _line_whitening_elements(normals: Array, sigma_px: float | Array) -> Array:
     position at its two corners, px, a scalar for all lines, or (4,).
     """
     across = (normals.T / sigma_px).ravel()
-    tilt = across * _TILT_TO_OFFSET_WHITENING_RATIO
+    tilt = across * _LINE_TILT_TO_OFFSET_WHITENING_RATIO
     return np.concatenate([across, across, -tilt, tilt])

@@ -16,8 +16,8 @@ import numpy as np
 
 from perchctl.geometry import Array, is_finite, wrap_rad
 from perchctl.vision.filter import (
-    PRINT,
-    TILTS,
+    PRINT_BIASES,
+    TILT_BIASES,
     FilterSetup,
     TrackMeasurement,
     vector_jacobian_wrt_tilt,
@@ -167,9 +167,9 @@ def make_track_measurement(
     noise = pose.xyz_yaw_cov.copy()
     noise[:3, :3] -= pose.shift_per_print_error_sigma_m.dot(pose.shift_per_print_error_sigma_m.T)
     shift_per_bias_sigma = np.zeros((4, 4))
-    shift_per_bias_sigma[1:, PRINT] = pose.shift_per_print_error_sigma_m
+    shift_per_bias_sigma[1:, PRINT_BIASES] = pose.shift_per_print_error_sigma_m
     if attitude is not None:
-        shift_per_bias_sigma[1:, TILTS] = (
+        shift_per_bias_sigma[1:, TILT_BIASES] = (
             vector_jacobian_wrt_tilt(lever_m) * filter_setup.roll_pitch_bias_sigma_rad
         )
     if is_in_world_frame and attitude is not None:
@@ -197,5 +197,7 @@ def gear_to_target_shift_per_bias_sigma_m(
     minus the effect of the roll and pitch biases on the gear."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     moved = attitude.R_world_level.T.dot(target_world_shift_per_bias_sigma_m)
-    moved[:, TILTS] -= vector_jacobian_wrt_tilt(gear_level) * filter_setup.roll_pitch_bias_sigma_rad
+    moved[:, TILT_BIASES] -= (
+        vector_jacobian_wrt_tilt(gear_level) * filter_setup.roll_pitch_bias_sigma_rad
+    )
     return np.asarray(moved)

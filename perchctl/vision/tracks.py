@@ -12,7 +12,7 @@ from perchctl.geometry import Array, is_finite, wrap_rad
 from perchctl.values import cached_property, replace
 from perchctl.vision.filter import (
     MAX_TRACK_GAP_S,
-    MEASURED,
+    MEASURED_ELEMENTS,
     POSITION,
     FilterSetup,
     TrackMeasurement,
@@ -124,7 +124,7 @@ def update_tracks(
             verdict = judge_pose(state.lock, state.rival, frame_pose, filter_setup)
         # A locked target stays locked, no matter how far the estimate's world frame has drifted
         # meanwhile.
-        goes_on = not verdict.restarts_track or verdict.restarts_at_locked_target
+        goes_on = not verdict.restarts_track or verdict.keeps_lock_at_restart
         goes_on = goes_on and drop_expired_lock_and_rival(state.lock, None, t_s)[0] is not None
         another = (
             None
@@ -157,14 +157,15 @@ def update_tracks(
 #
 # The lock changes to a rival that is seen with both markers. The change is immediate if the locked
 # target was never seen with both markers. Otherwise, the lock changes if the rival and the target
-# are equally far away and the target was not seen for `REACQUIRE_S` although its position is in the
-# image. If the lock has only a few frames, it changes to any rival that was seen more often.
+# are equally far away and the target was not seen for `MIN_RIVAL_DURATION_TO_LOCK_S` although its
+# position is in the image. If the lock has only a few frames, it changes to any rival that was seen
+# more often.
 #
 # If the camera is not on a vehicle, neither its motion nor the number of frames missing from a
 # recording is known, so a rival is most likely the target from a different viewpoint. The lock then
 # changes when only the rival has been seen for `MIN_RIVAL_ALONE_IN_VIEW_DURATION_S`, if the rival
 # shows both markers or if the locked target never did. A rival that was seen before the target was
-# lost is a second target, and the lock only changes to it after `REACQUIRE_S`.
+# lost is a second target, and the lock only changes to it after `MIN_RIVAL_DURATION_TO_LOCK_S`.
 #
 # While a rival is seen and the target is not, the target's predicted position may be wrong, so its
 # covariance also covers the rival's position.
@@ -177,7 +178,7 @@ def update_tracks(
 # world, but not in the image.
 
 
-REACQUIRE_S, REACQUIRE_FRAMES = 3.0, 30
+MIN_RIVAL_DURATION_TO_LOCK_S, MIN_RIVAL_FRAMES_TO_LOCK = 3.0, 30
 """Time, s, and number of frames with both markers after which the lock changes to a rival. Smaller:
 another target captures the lock."""
 MIN_RIVAL_ALONE_IN_VIEW_DURATION_S = 0.3
@@ -198,18 +199,18 @@ _MAX_ACCEPTED_INNOVATION_CHI2 = 25.0
 _MAX_RANGE_DIFFERENCE_SIGMAS = 4.0
 # Errors that no covariance includes (calibration, print, latency): constants and fractions of the
 # range.
-_MIN_UNMODELLED_M, _MIN_UNMODELLED_YAW_RAD = 0.01, math.radians(4.0)
-_UNMODELLED_ACROSS, _UNMODELLED_ALONG = 0.015, 0.02
+_MIN_UNMODELLED_POSITION_SIGMA_M, _UNMODELLED_YAW_SIGMA_RAD = 0.01, math.radians(4.0)
+_UNMODELLED_XY_SIGMA_PER_RANGE, _UNMODELLED_Z_SIGMA_PER_RANGE = 0.015, 0.02
 _POSITION_SELECTION_MATRIX: Array = np.diag([0.0, 1.0, 1.0, 1.0])
 # The message about a rival mentions the rival's rotation if it is larger than this angle.
 _MIN_RIVAL_ROTATION_TO_REPORT_RAD = math.radians(15.0)
 # A jump of the state estimate is only looked for if the target was seen at most this long ago.
 # Since then, a hovering vehicle has moved relative to the target with these standard deviations of
 # speed and rotation rate.
-_MAX_CALM_DURATION_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
+_MAX_LAST_VIEW_AGE_FOR_JUMP_S, _HOVER_SPEED_SIGMA_MPS, _HOVER_ROTATION_SIGMA_RADPS = 0.35, 0.3, 0.5
 # A jump of the state estimate, or a wrong last pose, is accepted as an explanation if it reduces
 # the squared innovation to less than this fraction of its value.
-_MAX_COST_RATIO_TO_ALTERNATIVE = 0.25
+_MAX_ALTERNATIVE_TO_TRACK_CHI2_RATIO = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +233,7 @@ class FramePose:
 @dataclass(frozen=True, eq=False)
 class GateVerdict:
     """The gate's decision on a pose: whether it is accepted as a pose of the target, and whether
-    the tracks restart at this pose (`restarts_track`). At a restart, `restarts_at_locked_target` is
+    the tracks restart at this pose (`restarts_track`). At a restart, `keeps_lock_at_restart` is
     True if the pose still belongs to the locked target, and False if the lock changes to the rival.
 
     `rival` is the rival track after this frame, None if there is none; `reason` explains a
@@ -241,7 +242,7 @@ class GateVerdict:
 
     is_accepted: bool
     restarts_track: bool = False
-    restarts_at_locked_target: bool = False
+    keeps_lock_at_restart: bool = False
     rival: RivalTrack | None = None
     reason: str = ""
     is_foreign_target: bool = False  # True if another vehicle's target is at this position
@@ -264,7 +265,7 @@ def judge_pose(
     two such tracks. A pose that fits neither track is still accepted, and the track restarts, if
     the state estimate has jumped or the previous pose was wrong. A rival's pose is accepted, and
     the track restarts at the rival, if the evidence for the rival is strong enough to replace the
-    target (`_is_rival_accepted`).
+    target (`_is_rival_accepted_as_target`).
     """
     lock, rival = drop_expired_lock_and_rival(lock, rival, frame_pose.t_s)
     if rival is not None and rival.is_in_world_frame != frame_pose.is_in_world_frame:
@@ -273,7 +274,7 @@ def judge_pose(
         return GateVerdict(is_accepted=True)
     if frame_pose.t_s <= lock.track.t_s:  # the tracks are already newer than this frame
         return GateVerdict(is_accepted=False, rival=rival)
-    if rival is None and _is_clearly_consistent(lock.track, frame_pose, filter_setup):
+    if rival is None and _is_pose_clearly_consistent(lock.track, frame_pose, filter_setup):
         return GateVerdict(is_accepted=True)
     innovation = _compute_innovation(lock.track, frame_pose, filter_setup)
     rival_misfit = (
@@ -289,22 +290,22 @@ def judge_pose(
         and rival_misfit.log_likelihood_cost < innovation.log_likelihood_cost
     ):
         return GateVerdict(is_accepted=True, rival=rival)
-    if not theirs and _matches_last_view(lock, frame_pose, innovation.yaw_xyz):
+    if not theirs and _has_state_estimate_jumped(lock, frame_pose, innovation.yaw_xyz):
         return GateVerdict(
             is_accepted=True,
             restarts_track=True,
-            restarts_at_locked_target=True,
+            keeps_lock_at_restart=True,
             reason=_ESTIMATE_JUMPED_TEXT,
         )
-    if not theirs and _matches_previous_track(lock, frame_pose, innovation.yaw_xyz, filter_setup):
+    if not theirs and _was_previous_pose_wrong(lock, frame_pose, innovation.yaw_xyz, filter_setup):
         return GateVerdict(
             is_accepted=True,
             restarts_track=True,
-            restarts_at_locked_target=True,
+            keeps_lock_at_restart=True,
             reason=_PREVIOUS_POSE_WRONG_TEXT,
         )
     seen = _update_rival(rival if theirs else None, frame_pose, innovation, filter_setup)
-    if _is_rival_accepted(lock, seen, frame_pose):
+    if _is_rival_accepted_as_target(lock, seen, frame_pose):
         text = f"target reacquired {innovation.distance_m:.2f} m from its expected position"
         return GateVerdict(is_accepted=True, restarts_track=True, reason=text)
     return GateVerdict(
@@ -370,7 +371,7 @@ def update_lock(
     are kept, unless the track has restarted at a rival or the frame (level or world) of the tracks
     has changed; in that case the lock starts over.
     """
-    anew = verdict.restarts_track and not verdict.restarts_at_locked_target
+    anew = verdict.restarts_track and not verdict.keeps_lock_at_restart
     before = (
         None
         if lock is None or anew or lock.is_in_world_frame != frame_pose.is_in_world_frame
@@ -421,18 +422,19 @@ def _compute_innovation(
     drift_m = (
         min(filter_setup.max_target_speed_mps, 1.0) / 3.0 * max(frame_pose.t_s - track.t_s, 0.0)
     )
-    residual = measurement.z - wanted.x[MEASURED]
+    residual = measurement.z - wanted.x[MEASURED_ELEMENTS]
     residual[0] = wrap_rad(float(residual[0]))
     # A bias shifts the measurement and the prediction alike, so only the difference of the shifts
     # counts.
     error_shifts = (
-        wanted.state_shift_per_bias_sigma[MEASURED]
+        wanted.state_shift_per_bias_sigma[MEASURED_ELEMENTS]
         if measurement.yaw_xyz_shift_per_bias_sigma is None
-        else measurement.yaw_xyz_shift_per_bias_sigma - wanted.state_shift_per_bias_sigma[MEASURED]
+        else measurement.yaw_xyz_shift_per_bias_sigma
+        - wanted.state_shift_per_bias_sigma[MEASURED_ELEMENTS]
     )
     R = filter_setup.R if measurement.R is None else measurement.R
     S = (
-        wanted.P[MEASURED, MEASURED]
+        wanted.P[MEASURED_ELEMENTS, MEASURED_ELEMENTS]
         + drift_m**2 * _POSITION_SELECTION_MATRIX
         + R
         + error_shifts @ error_shifts.T
@@ -440,14 +442,14 @@ def _compute_innovation(
     return _Innovation(residual, S + np.diag(_unmodelled_yaw_xyz_sigma(_range_m(frame_pose)) ** 2))
 
 
-def _is_clearly_consistent(
+def _is_pose_clearly_consistent(
     track: MarkerTrack, frame_pose: FramePose, filter_setup: FilterSetup
 ) -> bool:
     """True if the difference between the pose and the track's prediction is so small that the
     unmodelled errors of lens, print and latency alone explain it, as in most frames. This fast
     check, without any covariance, then makes the full one unnecessary."""
     wanted = predict_track(track, frame_pose.t_s, filter_setup)
-    residual = frame_pose.measurement.z - wanted.x[MEASURED]
+    residual = frame_pose.measurement.z - wanted.x[MEASURED_ELEMENTS]
     residual[0] = wrap_rad(float(residual[0]))
     residual /= _unmodelled_yaw_xyz_sigma(_range_m(frame_pose))
     return float(residual @ residual) <= _MAX_ACCEPTED_INNOVATION_CHI2
@@ -462,13 +464,13 @@ def _unmodelled_yaw_xyz_sigma(range_m: float) -> Array:
     covariance includes (calibration, print, latency). The values of x, y and z grow linearly with
     `range_m`, the distance from the camera to the target."""
     sideways_m, along_m = (
-        _MIN_UNMODELLED_M + _UNMODELLED_ACROSS * range_m,
-        _MIN_UNMODELLED_M + _UNMODELLED_ALONG * range_m,
+        _MIN_UNMODELLED_POSITION_SIGMA_M + _UNMODELLED_XY_SIGMA_PER_RANGE * range_m,
+        _MIN_UNMODELLED_POSITION_SIGMA_M + _UNMODELLED_Z_SIGMA_PER_RANGE * range_m,
     )
-    return np.array([_MIN_UNMODELLED_YAW_RAD, sideways_m, sideways_m, along_m])
+    return np.array([_UNMODELLED_YAW_SIGMA_RAD, sideways_m, sideways_m, along_m])
 
 
-def _matches_last_view(
+def _has_state_estimate_jumped(
     lock: TargetLock, frame_pose: FramePose, world_innovation_yaw_xyz: Array
 ) -> bool:
     """True if the state estimate has jumped: relative to the gear, the target is where the vehicle
@@ -476,15 +478,15 @@ def _matches_last_view(
     pose relative to the gear is then small enough for a hovering vehicle and much smaller than
     `world_innovation_yaw_xyz` (4,), which is measured minus predicted (yaw, x, y, z) in the world,
     rad and m. False in the level frame, and if the target was last seen more than
-    `_MAX_CALM_DURATION_S` ago."""
+    `_MAX_LAST_VIEW_AGE_FOR_JUMP_S` ago."""
     dt_s = frame_pose.t_s - lock.track.t_s
-    if not frame_pose.is_in_world_frame or dt_s > _MAX_CALM_DURATION_S:
+    if not frame_pose.is_in_world_frame or dt_s > _MAX_LAST_VIEW_AGE_FOR_JUMP_S:
         return False
     range_m = _range_m(frame_pose)
     residual = np.array([wrap_rad(frame_pose.pose.e_yaw_rad - lock.pose.e_yaw_rad), 0.0, 0.0, 0.0])
     residual[1:] = frame_pose.pose.e_m - lock.pose.e_m
-    moved_m = math.hypot(_CALM_MPS, _CALM_RADPS * range_m) * dt_s
-    moved = np.array([_CALM_RADPS * dt_s, moved_m, moved_m, moved_m])
+    moved_m = math.hypot(_HOVER_SPEED_SIGMA_MPS, _HOVER_ROTATION_SIGMA_RADPS * range_m) * dt_s
+    moved = np.array([_HOVER_ROTATION_SIGMA_RADPS * dt_s, moved_m, moved_m, moved_m])
     unclaimed = _unmodelled_yaw_xyz_sigma(range_m)
     seen, jumped = (
         float(((o / unclaimed) ** 2).sum()) for o in (residual, world_innovation_yaw_xyz)
@@ -493,10 +495,10 @@ def _matches_last_view(
         float((residual * residual / (unclaimed**2 + moved * moved)).sum())
         <= _MAX_ACCEPTED_INNOVATION_CHI2
     )
-    return calm and seen < _MAX_COST_RATIO_TO_ALTERNATIVE * jumped
+    return calm and seen < _MAX_ALTERNATIVE_TO_TRACK_CHI2_RATIO * jumped
 
 
-def _matches_previous_track(
+def _was_previous_pose_wrong(
     lock: TargetLock, frame_pose: FramePose, innovation_yaw_xyz: Array, filter_setup: FilterSetup
 ) -> bool:
     """True if the last accepted pose was most likely wrong: the new pose fits the track without the
@@ -515,7 +517,7 @@ def _matches_previous_track(
     )
     return (
         innovation.squared_mahalanobis <= _MAX_ACCEPTED_INNOVATION_CHI2
-        and before < _MAX_COST_RATIO_TO_ALTERNATIVE * now
+        and before < _MAX_ALTERNATIVE_TO_TRACK_CHI2_RATIO * now
     )
 
 
@@ -562,7 +564,9 @@ def _update_rival(
     )
 
 
-def _is_rival_accepted(lock: TargetLock, rival: RivalTrack, frame_pose: FramePose) -> bool:
+def _is_rival_accepted_as_target(
+    lock: TargetLock, rival: RivalTrack, frame_pose: FramePose
+) -> bool:
     if (
         lock.accepted_frame_count < MIN_ESTABLISHED_LOCK_FRAMES
         and rival.seen_frame_count > lock.accepted_frame_count
@@ -580,10 +584,10 @@ def _is_rival_accepted(lock: TargetLock, rival: RivalTrack, frame_pose: FramePos
     unseen_s = frame_pose.t_s - max(rival.first_seen_at_s, lock.track.t_s)
     # A target whose position is outside the image may still be there.
     return (
-        (frame_pose.is_locked_target_in_view or unseen_s >= 2.0 * REACQUIRE_S)
+        (frame_pose.is_locked_target_in_view or unseen_s >= 2.0 * MIN_RIVAL_DURATION_TO_LOCK_S)
         and not rival.has_different_range
-        and rival.frames_with_both_markers >= REACQUIRE_FRAMES
-        and unseen_s >= REACQUIRE_S
+        and rival.frames_with_both_markers >= MIN_RIVAL_FRAMES_TO_LOCK
+        and unseen_s >= MIN_RIVAL_DURATION_TO_LOCK_S
     )
 
 
@@ -644,7 +648,7 @@ def predict_corners(
     if tvec[2] <= 0.0:
         return None, None
     rvec = rotation_vector(R.dot(rotation_matrix(pose.rvec_rad)))
-    corners = project(setup.corners_m["joint"], rvec, tvec, setup.camera)
+    corners = project(setup.marker_corners_m["joint"], rvec, tvec, setup.camera)
     moved = PoseCandidate(rvec, tvec)
     if not is_finite(corners):
         return None, moved

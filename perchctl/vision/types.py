@@ -103,8 +103,8 @@ class Frame:
 
     `picture_kind` describes interlacing: ``whole`` for an image from one exposure, ``woven`` for
     two interlaced fields, ``top`` or ``bottom`` for one field interpolated to full height, None if
-    not classified yet (`perchctl.vision.fields`). `repeated` is True if the source returned the
-    previous image again; such an image is not a new measurement. `encoded` is the JPEG from the
+    not classified yet (`perchctl.vision.fields`). `is_repeated` is True if the source returned the
+    previous image again; such an image is not a new measurement. `source_jpeg` is the JPEG from the
     source, which `cv2.imdecode` decodes exactly to `image` with IMREAD_GRAYSCALE and
     IMREAD_IGNORE_ORIENTATION; None if the source sends no JPEG or if the image was modified.
     """
@@ -114,8 +114,8 @@ class Frame:
     image: NDArray[np.uint8]
     t_arrival_s: float = 0.0
     picture_kind: PictureKind | None = None
-    repeated: bool = False
-    encoded: bytes | None = None
+    is_repeated: bool = False
+    source_jpeg: bytes | None = None
 
 
 def to_grey(image: Any) -> NDArray[np.uint8]:
@@ -446,7 +446,7 @@ class MarkerPoses:
 
 
 @dataclass(frozen=True, eq=False)
-class FieldState:
+class InterlacingState:
     """What is known about the interlacing of an image stream.
 
     Attributes:
@@ -487,7 +487,7 @@ class PipelineState:
     frames_without_markers: int = 0  # number of successive frames without a marker
     lock: TargetLock | None = None
     rival: RivalTrack | None = None
-    field_state: FieldState = FieldState()
+    interlacing_state: InterlacingState = InterlacingState()
 
 
 @dataclass(frozen=True, eq=False)

@@ -352,7 +352,7 @@ class Experiment:
             self.source.poll(self.now())  # discard a frame from before Enter was pressed
         got = 0
         for _, frame in poll_frames(self.source, self.now, self.wait):
-            if frame is None or frame.repeated:
+            if frame is None or frame.is_repeated:
                 continue
             if got == 0:
                 height, width = frame.image.shape[:2]

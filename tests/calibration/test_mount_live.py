@@ -132,7 +132,7 @@ class _Film:
             return None
         self._count += 1
         again = self._count % self._times != 1 % self._times
-        return Frame(self._count, now_s, np.zeros((480, 640), np.uint8), now_s, repeated=again)
+        return Frame(self._count, now_s, np.zeros((480, 640), np.uint8), now_s, is_repeated=again)
 
     def problem(self, now_s: float) -> str | None:
         return "camera:0 is unplugged" if now_s > self._ends_s else None
@@ -153,7 +153,7 @@ class _Looks(PoseReader):
 
     def read_poses(self, frame: Frame) -> list[TargetPose]:
         self.mirrored += self._is_mirrored
-        due = [] if frame.repeated else [pose for pose in self._poses if pose.t_s <= frame.t_s]
+        due = [] if frame.is_repeated else [pose for pose in self._poses if pose.t_s <= frame.t_s]
         del self._poses[: len(due)]
         return due
 

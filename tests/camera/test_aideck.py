@@ -69,12 +69,12 @@ def test_raw_and_jpeg_pictures_of_each_size(
     deck.scripts.put([console(), raw(image), console(), go, jpeg(image), NEVER])
     source = read()
     first = next_frame(source)
-    assert first.encoded is None
+    assert first.source_jpeg is None
     assert (first.image == image).all()
     go.set()
     second = next_frame(source)
-    assert second.encoded is not None
-    as_sent = cv2.imdecode(np.frombuffer(second.encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert second.source_jpeg is not None
+    as_sent = cv2.imdecode(np.frombuffer(second.source_jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
     np.testing.assert_array_equal(as_sent, second.image)
     assert np.abs(second.image.astype(float) - image).mean() < 4.0
 
@@ -211,7 +211,7 @@ def test_what_stands_behind_a_jpeg_s_end_is_padding(
     deck.scripts.put([header(324, 244, len(data), 1) + b"".join(chunks(data)), NEVER])
     frame = next_frame(read())
     assert level(frame) == 80
-    assert frame.encoded == WHOLE_JPEG
+    assert frame.source_jpeg == WHOLE_JPEG
 
 
 def test_pictures_that_are_dropped_in_flight_are_named(deck: AiDeck, read: Read) -> None:
@@ -248,7 +248,7 @@ def test_a_colour_camera_is_found_once_and_stays_one(deck: AiDeck, read: Read) -
     assert (found(plain) == remove_mosaic(plain)).all(), "a scene that hides it changes nothing"
     assert (MosaicFilter()(plain) == plain).all()
     deck.forever = [jpeg(mosaic)]
-    assert next_frame(read()).encoded is None, "it is not the JPEG that came any more"
+    assert next_frame(read()).source_jpeg is None, "it is not the JPEG that came any more"
 
 
 # --- A command through it -----------------------------------------------------------------

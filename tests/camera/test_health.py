@@ -98,7 +98,7 @@ def test_a_frozen_picture_first_repeats_then_is_frozen() -> None:
 
 def test_recordings_may_repeat_and_what_a_source_calls_repeated_is() -> None:
     assert set(judge([noisy(120, 5.0)] * 30, live=False)) == {"ok"}
-    repeated = replace(frame(noisy(120, 5.0)), repeated=True)
+    repeated = replace(frame(noisy(120, 5.0)), is_repeated=True)
     assert FrameHealth().assess(repeated) == "repeated"
 
 
@@ -112,15 +112,15 @@ def test_a_repetition_takes_no_new_pictures_place() -> None:
     slot.put(a.copy(), 1.016, 1.116)
     first = slot.take()
     assert first is not None
-    assert (first.index, first.t_s, first.repeated) == (0, 1.0, False), "at its first time"
+    assert (first.index, first.t_s, first.is_repeated) == (0, 1.0, False), "at its first time"
     slot.put(a.copy(), 1.033, 1.133)
     again = slot.take()
     assert again is not None
-    assert (again.index, again.t_arrival_s, again.repeated) == (0, 1.133, True)
+    assert (again.index, again.t_arrival_s, again.is_repeated) == (0, 1.133, True)
     slot.put(a.copy(), 1.05, 1.15)
     slot.put(b, 1.06, 1.16)
     slot.put(b.copy(), 1.07, 1.17)
     new = slot.take()
     assert new is not None
-    assert (new.index, new.t_s, new.repeated) == (1, 1.06, False)
+    assert (new.index, new.t_s, new.is_repeated) == (1, 1.06, False)
     assert slot.take() is None

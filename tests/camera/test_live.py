@@ -52,7 +52,7 @@ def test_the_newest_frame_is_stamped_at_arrival_less_the_latency_and_given_once(
     first = next_frame(source)
     assert (first.index, level(first), first.t_arrival_s) == (0, 60, 100.0)
     assert first.t_s == pytest.approx(99.93)
-    assert first.encoded == picture
+    assert first.source_jpeg == picture
     as_sent = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_GRAYSCALE)
     np.testing.assert_array_equal(as_sent, first.image)
     assert source.size_px == (64, 48)

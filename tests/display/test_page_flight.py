@@ -26,8 +26,8 @@ from perchctl.mission import (
     OperatorRequest,
     Outcome,
     Phase,
-    RestReport,
     RestState,
+    RestStateReport,
     Watcher,
 )
 from perchctl.profile import load_profile
@@ -203,7 +203,7 @@ def test_a_failed_flight_names_its_log_if_there_is_one_and_what_the_rescue_said(
     flight.fail(Interrupted("interrupted before take-off"), None)
     card = state_of(page)["card"]
     assert (card["outcome"], card["good"], card["rows"]) == ("FAILED", False, [])
-    found = RestReport(RestState.UNKNOWN)
+    found = RestStateReport(RestState.UNKNOWN)
     flight.event(Event.make_rescue_note(START_S, RuntimeError(), found.state, found.text))
     flight.event(note(START_S, "the recording has ended (no space): the flight and its log go on"))
     flight.fail(RuntimeError("boom"), tmp_path)
@@ -252,7 +252,7 @@ def test_the_page_of_a_flight_ends_with_its_card(
         report = FlightReport(
             Phase.LANDED, Outcome.TARGET_NOT_FOUND, "target not found", 0, 9.0, False
         )
-        return replace(report, detached_watchers=("a callback was detached",)), None
+        return replace(report, detached_watcher_messages=("a callback was detached",)), None
 
     monkeypatch.setattr(fly, "_session", session)
     assert fly.fly_and_report(options, as_json=False, view=True) == 50

@@ -13,7 +13,10 @@ import pytest
 from perchctl.flight import loop
 from perchctl.flight.watchdog import CUT_PERIOD_S
 from perchctl.mission import EventKind, OperatorRequest, Outcome, Phase, RestState, Tick
-from perchctl.mission.descent import MAX_LANDING_COMMAND_COUNT, MIN_LANDING_COMMAND_COUNT
+from perchctl.mission.descent import (
+    MAX_LANDING_COMMAND_COUNT,
+    MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION,
+)
 from perchctl.perception import perception
 from perchctl.profile import Profile
 from perchctl.vehicle import HL_ACTIVE, EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
@@ -166,7 +169,7 @@ def test_it_is_bounded() -> None:
     rig.link.motors = False
     rig.rescue(telemetry(0.0))
     assert rig.link.now_s == pytest.approx(PROFILE.planner.landing.timeout_s, abs=0.2)
-    assert len(rig.link.said(Land)) == MIN_LANDING_COMMAND_COUNT
+    assert len(rig.link.said(Land)) == MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION
 
 
 def test_it_lands_on_the_ground_that_it_started_from_even_without_telemetry() -> None:

@@ -15,11 +15,11 @@ from perchctl.mission.belief.update import KEEPALIVE_RAW_THRUST
 from perchctl.mission.descent import (
     LANDING_COMMAND_PERIOD_S,
     MAX_LANDING_COMMAND_COUNT,
-    MIN_LANDING_COMMAND_COUNT,
+    MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION,
 )
 from perchctl.mission.release import (
     CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M,
-    STOP_COMMAND_COUNT,
+    MOTOR_STOP_COMMAND_COUNT,
 )
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -210,9 +210,12 @@ def test_a_silence_of_a_second_lands_and_repeats_until_it_shows() -> None:
     assert rig.after(late_s + 0.05) is None
     active = READY | HL_ACTIVE  # also shown where the notify was lost, and nothing lands
     again_s = LANDING_COMMAND_PERIOD_S + 0.01
-    for i in range(1, MIN_LANDING_COMMAND_COUNT):
+    for i in range(1, MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION):
         assert isinstance(rig.after(late_s + i * again_s, supervisor=active), Land)
-    assert rig.after(late_s + MIN_LANDING_COMMAND_COUNT * again_s, supervisor=active) is None
+    assert (
+        rig.after(late_s + MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION * again_s, supervisor=active)
+        is None
+    )
 
 
 def test_a_landing_is_ordered_a_limited_number_of_times() -> None:
@@ -252,7 +255,7 @@ def test_a_landing_of_the_vehicles_own_is_left_alone() -> None:
     landing = remembering(
         IN_AIR,
         phase=Phase.LANDING,
-        stop_or_land_command_count=MIN_LANDING_COMMAND_COUNT,
+        stop_or_land_command_count=MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION,
         last_stop_or_land_command_at_s=T_S,
     )
     rig = Rig(Idle(), landing)
@@ -309,7 +312,7 @@ def test_what_does_not_peel_off_is_let_go_watched_and_stopped() -> None:
     assert raw[-1] == KEEPALIVE_RAW_THRUST
     complete = PROFILE.planner.complete
     assert len(raw) * 0.02 == pytest.approx(complete.ramp_s + complete.hang_s, abs=0.2)
-    assert sent[-STOP_COMMAND_COUNT:] == [StopMotors()] * STOP_COMMAND_COUNT
+    assert sent[-MOTOR_STOP_COMMAND_COUNT:] == [StopMotors()] * MOTOR_STOP_COMMAND_COUNT
     assert rig.poll(9.5, None) in (None, StopMotors())  # no order spins its motors up again
 
 

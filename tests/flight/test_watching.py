@@ -105,7 +105,7 @@ def test_a_watcher_that_raises_is_left_out_and_named(part: str) -> None:
     report, works = flown(breaks)
     assert report.outcome.value == "operator"
     assert breaks.calls == 1
-    (said,) = report.detached_watchers
+    (said,) = report.detached_watcher_messages
     assert said.startswith("the display raised Broken: by the test (test_watching.py, line ")
     assert [note for note in notes(works) if note.startswith("the display raised Broken")] or (
         part == "event"  # at the landing: its note would come in the next tick
@@ -115,7 +115,7 @@ def test_a_watcher_that_raises_is_left_out_and_named(part: str) -> None:
 
 def test_a_watcher_without_a_name_is_named_by_its_class() -> None:
     report, _ = flown(Breaks("tick", name=""))
-    assert report.detached_watchers[0].startswith("Breaks raised Broken")
+    assert report.detached_watcher_messages[0].startswith("Breaks raised Broken")
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_the_flight_s_own_watchers_have_names_for_people(kind: Any) -> None:
     own.problem = None
     rig = ordered(Rig())
     report = fly(replace(rig.parts(), watchers=(own,)))
-    assert report.detached_watchers[0].startswith("the ")
+    assert report.detached_watcher_messages[0].startswith("the ")
 
 
 @pytest.mark.parametrize("lands", [False, True])
@@ -180,7 +180,7 @@ def test_a_log_that_raises_before_take_off_may_be_a_refusal(refuses: bool) -> No
     rig.profile = rig.profile.with_({"safety.land_on_log_error": refuses})
     breaks = BreaksAsALog("turn")
     if not refuses:
-        assert flown(breaks, rig=rig)[0].detached_watchers
+        assert flown(breaks, rig=rig)[0].detached_watcher_messages
         return
     with pytest.raises(SafetyAbort, match="flight log: the display raised Broken"):
         fly(replace(rig.parts(), watchers=(breaks,)))
@@ -197,7 +197,7 @@ def test_a_log_that_raises_in_the_link_s_thread_keeps_no_command_back(
     breaks.now = lambda: BREAKS_S
     report = fly(replace(rig.parts(), watchers=(breaks,)))
     assert breaks.calls == 1
-    assert report.detached_watchers
+    assert report.detached_watcher_messages
     assert rig.link.z_m == 0.0
 
 
@@ -250,7 +250,7 @@ def test_a_watcher_that_hangs_is_named_once() -> None:
 
     slow = Watcher(hang)
     report, works = flown(rig=rig, judges=(slow,))
-    assert report.detached_watchers == ()
+    assert report.detached_watcher_messages == ()
     (said,) = [note for note in notes(works) if "not controlled" in note]
     assert said == "Watcher took 0.4 s, during which the flight was not controlled"
     assert len(hung) == 2

@@ -51,7 +51,7 @@ def decided_here(name: str) -> tuple[bytes, ...]:
                 failed_attempts=new.failed_attempts,
                 command=command,
                 outcome=new.outcome,
-                reason=new.reason,
+                reason=new.transition_reason,
             )
         )
         rest = {key: value for key, value in record.items() if key not in names}

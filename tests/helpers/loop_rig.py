@@ -22,7 +22,7 @@ from perchctl.mission import (
     OperatorRequest,
     Phase,
     PlannerState,
-    RestReport,
+    RestStateReport,
     SentCommand,
     Tick,
 )
@@ -302,7 +302,7 @@ class Rig:
     def fly(self) -> FlightReport:
         return fly(self.parts())
 
-    def rescue(self, known: Telemetry, age_s: float = 0.0, **state: Any) -> RestReport:
+    def rescue(self, known: Telemetry, age_s: float = 0.0, **state: Any) -> RestStateReport:
         """A rescue of what was flying as `known` and `state` say, its positions `age_s` old."""
         ground = replace(known, position_m=(0.0, 0.0, 0.0))
         told = {"phase": Phase.ALIGN, "hover_thrust": HOVER_THRUST, "last_telemetry": known} | state

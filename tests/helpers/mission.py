@@ -13,7 +13,7 @@ from perchctl.mission.belief.battery import BatteryFit
 from perchctl.mission.belief.belief import Belief
 from perchctl.mission.belief.thrust import HoverThrust
 from perchctl.mission.context import Context
-from perchctl.mission.observe import observe
+from perchctl.mission.observe import update_state_with_observation
 from perchctl.mission.phase import Severity
 from perchctl.mission.state import DescentState, HoverErrors
 from perchctl.mission.table import PHASE_CONDITIONS, PHASES
@@ -242,7 +242,7 @@ def context_at(state: PlannerState, obs: Observation, profile: Profile = PROFILE
 
 def observing(state: PlannerState, obs: Observation, profile: Profile = PROFILE) -> PlannerState:
     """The state with the observation taken in, and nothing decided."""
-    return observe(state, obs, profile, PHASES[state.phase].maneuver)
+    return update_state_with_observation(state, obs, profile, PHASES[state.phase].maneuver)
 
 
 def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:

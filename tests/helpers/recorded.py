@@ -35,7 +35,7 @@ def frame(number: int, t_s: float, as_jpeg: bool) -> Frame:
         return Frame(number, t_s, image, t_s + LATENCY_S)
     data = cv2.imencode(".jpg", cv2.GaussianBlur(image, (0, 0), 3.0))[1]
     decoded = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), np.uint8)
-    return Frame(number, t_s, decoded, t_s + LATENCY_S, encoded=data.tobytes())
+    return Frame(number, t_s, decoded, t_s + LATENCY_S, source_jpeg=data.tobytes())
 
 
 def frames(count: int) -> list[Frame]:

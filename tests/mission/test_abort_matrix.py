@@ -188,7 +188,7 @@ def test_every_phase_meets_every_abort(phase: Phase, name: str) -> None:
         # A heading that jumped is set anew first, so that the firmware does not turn by the jump.
         level = name in LEVEL and name != "heading-lost"
         down(commands[-1], state.entry.position_m[2], by_itself=by_itself, level=level)
-    assert state.reason
+    assert state.transition_reason
 
 
 @pytest.mark.parametrize("name", PROFILES)

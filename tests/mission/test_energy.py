@@ -165,10 +165,10 @@ def test_a_landing_that_has_begun_goes_on_after_low_power(
         replace(FINE_BATTERY, rest_v=rest_v), PROFILE, hover, BRUSHED_POWER_TRAIN
     )
     assert times is not None
-    assert 0.0 <= times.until_battery_low_s <= times.until_min_load_v_s
+    assert 0.0 <= times.until_battery_low_s <= times.until_min_load_voltage_s
     time_left_s = times.until_landing_must_begin_s(landing_s, reserve_s)
     assert time_left_s <= times.until_battery_low_s
-    assert time_left_s + landing_s + reserve_s <= max(times.until_min_load_v_s, 0.0) + 1e-9
+    assert time_left_s + landing_s + reserve_s <= max(times.until_min_load_voltage_s, 0.0) + 1e-9
     no_landing_s = times.until_landing_must_begin_s(0.0, 0.0)
     assert no_landing_s - landing_s - reserve_s <= time_left_s + 1e-9
 
@@ -225,7 +225,7 @@ def test_no_attempt_begins_on_a_battery_near_its_end(phase: Phase) -> None:
     assert state.phase is Phase.LANDING
     assert state.transition_name == "too-little-left"
     assert state.outcome is Outcome.SAFETY
-    assert " s left" in state.reason
+    assert " s left" in state.transition_reason
     assert flown(phase, FINE_BATTERY, 2.0).phase in (Phase.ASCEND, Phase.ESTIMATE)
 
 
@@ -256,7 +256,7 @@ def test_the_gate_holds_back_only_what_has_too_little_and_has_not_begun(
     assert (state.transition_name == "too-little-left") is gated
     assert gated or phase is not Phase.ALIGN or state.transition_name == "aligned"
     if gated and energy.rest_v is None:
-        assert "unknown" in state.reason
+        assert "unknown" in state.transition_reason
         assert state.battery.hover_time_left_s is None
 
 

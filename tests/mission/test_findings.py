@@ -81,7 +81,7 @@ def test_what_the_magnet_caught_on_its_way_down_has_a_distance_too(phase: Phase)
     """A contact is proven only in PERCH; what hangs after a landing was carried there by the dead
     reckoning."""
     dead_reckoning = DeadReckoning(
-        imu=ImuMotion(t_s=BEGIN_S),
+        imu_at_last_update=ImuMotion(t_s=BEGIN_S),
         gear_to_target_world_xy_m=(0.03, 0.04),
         gear_to_target_sigma_m=0.01,
     )

@@ -44,7 +44,7 @@ drifts = st.sampled_from(
         HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_DESCENT,
     ]
 )
-DESCENDS = CommandHistory(maneuver=Maneuver(descends_to_floor=True), raw_thrust=48_000)
+DESCENDS = CommandHistory(maneuver=Maneuver(descends_to_floor=True), commanded_raw_thrust=48_000)
 
 
 def believing(phase: Phase, thrust: float, acc_z_g: float = 1.0) -> Belief:

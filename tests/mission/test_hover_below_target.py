@@ -11,7 +11,7 @@ import pytest
 
 from perchctl.mission import Outcome, Phase
 from perchctl.mission.phases.hover import (
-    MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S,
+    MAX_HEIGHT_RETURN_DURATION_TO_KEEP_HOVER_TIMER_S,
     MAX_SINK_BELOW_HOVER_HEIGHT_M,
 )
 from perchctl.mission.report import HoverReport
@@ -60,7 +60,8 @@ def sunk_for(low_s: float) -> Look:
 
 
 @pytest.mark.parametrize(
-    ("low_s", "goes_on"), [(1.0, True), (MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S + 1.0, False)]
+    ("low_s", "goes_on"),
+    [(1.0, True), (MAX_HEIGHT_RETURN_DURATION_TO_KEEP_HOVER_TIMER_S + 1.0, False)],
 )
 def test_the_time_of_a_hover_goes_on_while_it_climbs_back(low_s: float, goes_on: bool) -> None:
     """Unless that takes so long that it was no hover."""
@@ -185,4 +186,4 @@ def test_a_hover_near_the_ground_or_the_limit_is_refused_in_a_sentence(
 ) -> None:
     state = fly(state_in(Phase.ALIGN), at(), 0.6, profile, one_phase=True).state
     assert (state.phase, state.transition_name) == (Phase.LANDING, "hover-height")
-    assert words in state.reason
+    assert words in state.transition_reason

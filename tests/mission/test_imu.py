@@ -91,18 +91,18 @@ def test_after_a_silence_the_estimate_s_own_change_counts() -> None:
     after = telemetry(1.7, velocity_mps=(0.1, 0.2, -0.5))
     imu = flown([before])
     old = DeadReckoning(
-        imu, velocity_mps=(0.0, 0.0, 0.05), estimated_velocity_mps=before.velocity_mps
+        imu, velocity_world_mps=(0.0, 0.0, 0.05), estimated_velocity_world_mps=before.velocity_mps
     )
     heard = imu.with_sample(before, after)
     new = advance_dead_reckoning(old, heard, after, is_estimate_trusted=False)
-    assert new.velocity_mps == pytest.approx((0.0, 0.2, -0.6))
+    assert new.velocity_world_mps == pytest.approx((0.0, 0.2, -0.6))
     assert (
-        advance_dead_reckoning(old, heard, after, is_estimate_trusted=True).velocity_mps
+        advance_dead_reckoning(old, heard, after, is_estimate_trusted=True).velocity_world_mps
         == after.velocity_mps
     )
     assert advance_dead_reckoning(
         old, heard, after, is_estimate_trusted=False, is_position_diverged=True
-    ).velocity_mps == (old.velocity_mps)
+    ).velocity_world_mps == (old.velocity_world_mps)
 
 
 @given(
@@ -232,7 +232,7 @@ def estimate_only_mps(
             dead_reckoning, motion, new, is_estimate_trusted=True
         )
         last = new
-    return abs(dead_reckoning.lateral_velocity_missed_by_imu_mps[0])
+    return abs(dead_reckoning.recent_estimate_minus_imu_velocity_world_xy_mps[0])
 
 
 def test_an_estimate_that_moves_otherwise_than_it_feels_is_told_from_one_that_was_pushed() -> None:

@@ -127,7 +127,7 @@ def context(
         t_s=NOW_S - TICK_S, last_telemetry=sample, dead_reckoned_height_m=z_m,
         vehicle_world_z_at_last_contact_m=z_m if held else None,
         magnet_reach_entered_at_s=NOW_S - 2.0 if held else None,
-        dead_reckoning=DeadReckoning(imu=ImuMotion(t_s=sample.t_s)),
+        dead_reckoning=DeadReckoning(imu_at_last_update=ImuMotion(t_s=sample.t_s)),
     )  # fmt: skip
     state = remembering(state, **{**remembered, **changes})
     obs = observation(NOW_S, telemetry=replace(sample, **(tel or {})), target=None, **observed)
@@ -331,7 +331,7 @@ def test_a_mounting_that_seems_turned_may_be_the_capture_s_axes(
         "mounting",
         astray,
     )
-    assert ("motion capture may have swapped axes" in state.reason) is astray
+    assert ("motion capture may have swapped axes" in state.transition_reason) is astray
     assert isinstance(command, RawThrust if astray else PositionSetpoint)
 
 
@@ -429,7 +429,9 @@ def test_a_floor_that_was_felt_is_one_unless_it_falls_with_its_thrust(
 ) -> None:
     """On half of the hover thrust: in the air the accelerometer reads half a g."""
     half = 0.5 * HOVER_THRUST
-    aside = DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.01), velocity_mps=(0.8, 0.0, 0.0))
+    aside = DeadReckoning(
+        imu_at_last_update=ImuMotion(t_s=NOW_S - 0.01), velocity_world_mps=(0.8, 0.0, 0.0)
+    )
     c = context(
         "imu", z_m=0.02, tel={"acc_z_g": acc_z_g, "thrust": half},
         floor_detected_at_s=NOW_S - 0.5, last_commanded_raw_thrust=half, dead_reckoning=aside,
@@ -444,7 +446,7 @@ def test_a_floor_that_was_felt_is_one_unless_it_falls_with_its_thrust(
 def test_a_blow_from_below_is_the_floor_s_only_if_it_sank(impact_mps: float, floor: bool) -> None:
     """A vehicle that climbs, just after the lift-off, has not met the floor."""
     imu = ImuMotion(t_s=NOW_S - 0.01, last_impact_or_bounce_at_s=NOW_S - 0.05)
-    struck = DeadReckoning(imu=imu, climb_before_impact_mps=impact_mps)
+    struck = DeadReckoning(imu_at_last_update=imu, climb_before_impact_mps=impact_mps)
     c = context("imu", z_m=0.15, dead_reckoning=struck)
     c = Context(
         replace(c.state, belief=c.belief.with_observation(replace(c.obs, imu=imu), c.profile))
@@ -482,7 +484,7 @@ def test_level_is_against_the_wind_and_the_error_of_the_attitude(
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
     imu, reads_mps2 = ImuMotion(t_s=NOW_S - 0.01), 9.81 * wind_g
     dead_reckoning = DeadReckoning(
-        imu=imu,
+        imu_at_last_update=imu,
         acceleration_bias_world_mps2=(
             acceleration_bias_mps2 * cos,
             acceleration_bias_mps2 * sin,
@@ -506,16 +508,17 @@ def test_level_is_against_the_wind_and_the_error_of_the_attitude(
 
 
 def test_the_felt_speed_is_braked_whatever_the_estimate_says() -> None:
-    c = context("imu", dead_reckoning=DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.03)))
+    c = context("imu", dead_reckoning=DeadReckoning(imu_at_last_update=ImuMotion(t_s=NOW_S - 0.03)))
     motion = VisualInertialMotion(NOW_S - 0.01, (0.3, 0.0), (0.0, 0.0), 0.0)
     obs = replace(c.obs, visual_inertial_motion=motion, imu=replace(c.obs.imu, t_s=NOW_S - 0.01))
     state = observing(c.state, obs, c.profile)
-    assert state.belief.dead_reckoning.velocity_mps[:2] == (0.3, 0.0)
+    assert state.belief.dead_reckoning.velocity_world_mps[:2] == (0.3, 0.0)
     later = replace(obs, imu=replace(obs.imu, t_s=NOW_S + 0.01))  # the same motion again
     moved = remembering(
-        state, dead_reckoning=replace(state.belief.dead_reckoning, velocity_mps=(0.1, 0.0, 0.0))
+        state,
+        dead_reckoning=replace(state.belief.dead_reckoning, velocity_world_mps=(0.1, 0.0, 0.0)),
     )
-    assert observing(moved, later, c.profile).belief.dead_reckoning.velocity_mps[0] < 0.2
+    assert observing(moved, later, c.profile).belief.dead_reckoning.velocity_world_mps[0] < 0.2
 
 
 @pytest.mark.parametrize(("phase", "since_s", "is_there"), [
@@ -534,7 +537,9 @@ def test_what_carries_it_near_its_only_position_is_the_target(
 @pytest.mark.parametrize("later_s", [0.0, 0.5])
 def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
     """Its vertical speed is what they tell with the right delay, and the floor may be near."""
-    dead_reckoning = DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.03), velocity_mps=(0.0, 0.0, -0.7))
+    dead_reckoning = DeadReckoning(
+        imu_at_last_update=ImuMotion(t_s=NOW_S - 0.03), velocity_world_mps=(0.0, 0.0, -0.7)
+    )
     c = context("imu", dead_reckoned_height_m=2.0, dead_reckoning=dead_reckoning)
     motion = VisualInertialMotion(NOW_S - 0.01, (0.0, 0.0), (0.0, 0.0), -0.4)
     obs = replace(
@@ -544,11 +549,12 @@ def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
     )
     obs = replace(obs, imu=replace(obs.imu, t_s=NOW_S))
     state = observing(c.state, obs, c.profile)
-    assert state.belief.dead_reckoning.velocity_mps[2] == pytest.approx(
+    assert state.belief.dead_reckoning.velocity_world_mps[2] == pytest.approx(
         -0.4 if later_s else -0.7, abs=0.05
     )
     state = remembering(
-        state, dead_reckoning=replace(state.belief.dead_reckoning, velocity_mps=(0.0, 0.0, -0.4))
+        state,
+        dead_reckoning=replace(state.belief.dead_reckoning, velocity_world_mps=(0.0, 0.0, -0.4)),
     )
     _, command = descent.act_in_landing(context_at(state, obs, c.profile))
     assert isinstance(command, RawThrust)
@@ -558,7 +564,9 @@ def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
 @pytest.mark.parametrize("behind_s", [0.0, 0.05, 0.5, 5.0])
 def test_without_the_state_block_pictures_measure_the_climb_rate(behind_s: float) -> None:
     """Seed 2612011437: the accelerometer alone was wrong by 0.25 m/s after three seconds."""
-    dead_reckoning = DeadReckoning(imu=ImuMotion(t_s=NOW_S - 0.03), velocity_mps=(0.0, 0.0, -0.7))
+    dead_reckoning = DeadReckoning(
+        imu_at_last_update=ImuMotion(t_s=NOW_S - 0.03), velocity_world_mps=(0.0, 0.0, -0.7)
+    )
     c = context("imu", dead_reckoning=dead_reckoning, tel={"behind_s": behind_s})
     motion = VisualInertialMotion(NOW_S - 0.01, (0.0, 0.0), (0.0, 0.0), -0.95)
     obs = replace(c.obs, visual_inertial_motion=motion, imu=replace(c.obs.imu, t_s=NOW_S))
@@ -571,7 +579,9 @@ def test_without_the_state_block_pictures_measure_the_climb_rate(behind_s: float
 def test_positions_that_have_diverged_place_the_floor_anywhere(diverged: bool) -> None:
     """Seed 20591183: late motion capture placed the floor 0.9 m too low, and the vehicle struck it
     at the speed that is meant for free air."""
-    dead_reckoning = DeadReckoning(imu=ImuMotion(t_s=NOW_S), velocity_mps=(0.0, 0.0, -0.4))
+    dead_reckoning = DeadReckoning(
+        imu_at_last_update=ImuMotion(t_s=NOW_S), velocity_world_mps=(0.0, 0.0, -0.4)
+    )
     c = context(
         "imu",
         dead_reckoned_height_m=2.0,
@@ -631,7 +641,7 @@ def ended(
         state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M), motor_stop_commanded_at_s=NOW_S - 1.0,
         magnet_reach_entered_at_s=magnet_reach_entered_at_s,
         floor_detected_at_s=floor_detected_at_s,
-        dead_reckoning=replace(dead_reckoning, imu=imu),
+        dead_reckoning=replace(dead_reckoning, imu_at_last_update=imu),
     )  # fmt: skip
     return rest.find_rest_state(context_at(state, obs, profile))
 

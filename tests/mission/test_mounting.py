@@ -168,7 +168,7 @@ def test_a_turned_mounting_lands_and_says_so(deg: int) -> None:
         "mounting",
         Outcome.SAFETY,
     )
-    assert f"rotated by about {deg} deg" in state.reason
+    assert f"rotated by about {deg} deg" in state.transition_reason
     assert max(it.far_m) < 0.17
 
 
@@ -197,4 +197,4 @@ def test_a_target_below_the_vehicle_is_not_believed() -> None:
 
     state = fly(state_in(Phase.ALIGN), look, 0.58).state
     assert state.transition_name == "mounting"
-    assert "camera.mount does not point the camera up" in state.reason
+    assert "camera.mount does not point the camera up" in state.transition_reason

@@ -11,9 +11,9 @@ import pytest
 
 from perchctl.mission import Observation, Outcome, Phase, PlannerState
 from perchctl.mission.belief.contact import current_gear_to_target
-from perchctl.mission.belief.quality import MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS
+from perchctl.mission.belief.quality import MAX_RECENT_ESTIMATE_MINUS_IMU_VELOCITY_MPS
 from perchctl.mission.belief.reckoning import DeadReckoning
-from perchctl.mission.descent import MIN_LANDING_COMMAND_COUNT
+from perchctl.mission.descent import MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION
 from perchctl.mission.planner import step_mission
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -96,7 +96,7 @@ def test_a_deck_whose_positions_end_is_noticed_by_the_variance(phase: Phase, los
         if state.phase is Phase.LANDING:
             break
     assert (state.phase, state.transition_name, state.outcome) == LOST
-    assert "variance keeps growing" in state.reason
+    assert "variance keeps growing" in state.transition_reason
     assert LAND_S <= len(sent) * TICK_S <= 1.0
     assert isinstance(sent[-1], RawThrust)
 
@@ -250,7 +250,7 @@ def test_what_nobody_saw_hang_has_not_perched(
     assert flight.state.phase is ends
     if ends is Phase.ABORTED:
         assert "fell-unseen" in flight.rows
-        assert "unknown" in flight.state.reason
+        assert "unknown" in flight.state.transition_reason
 
 
 def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> None:
@@ -335,7 +335,7 @@ def test_a_step_of_the_estimate_makes_the_place_of_the_gear_unsure(
 
     flight = fly(state_in(Phase.PERCH, z_m=HANG_Z_M), look, 1.3, profile, feels=True)
     assert math.hypot(
-        *flight.state.belief.dead_reckoning.unexplained_position_step_sum_xy_m
+        *flight.state.belief.dead_reckoning.unexplained_position_step_sum_world_xy_m
     ) == pytest.approx(sigma_m, abs=1e-3)
     assert current_gear_to_target(flight.state.belief).sigma_m >= sigma_m - 1e-3
 
@@ -423,7 +423,7 @@ def test_a_climb_that_goes_sideways_is_ended_level_by_thrust_alone(
     it = Falls(hover, felt_too_much_g)
     state = fly(begin, it, 5.0, MOCAP, feels=True).state
     assert (state.phase, state.transition_name) == (Phase.LANDING, "position-astray")
-    assert "perchctl check --lift" in state.reason
+    assert "perchctl check --lift" in state.transition_reason
     assert -0.9 < it.met_mps < 0.0
     assert it.highest_m < 0.3
 
@@ -498,7 +498,9 @@ def test_positions_that_are_late_swing_it_up_and_down(
     target at 1 m/s, and was taken for held by something else."""
     state = fly(state_in(phase), at(velocity_mps=(0.0, 0.0, climb_mps)), profile=profile).state
     assert (state.transition_name == "position-astray") is (lands and profile is MOCAP)
-    assert ("vertical oscillation" in state.reason) is (state.transition_name == "position-astray")
+    assert ("vertical oscillation" in state.transition_reason) is (
+        state.transition_name == "position-astray"
+    )
 
 
 def gains_beside(
@@ -508,13 +510,15 @@ def gains_beside(
     felt = Felt()
     begun = felt(at()(BEGIN_S))
     state = remembering(
-        state, last_telemetry=begun.telemetry, dead_reckoning=DeadReckoning(imu=begun.imu)
+        state,
+        last_telemetry=begun.telemetry,
+        dead_reckoning=DeadReckoning(imu_at_last_update=begun.imu),
     )
     for t_s in times(lasts_s):
         if not state.belief.is_position_diverged:
             beside = replace(
                 state.belief.dead_reckoning,
-                lateral_velocity_missed_by_imu_mps=(0.0, estimate_only_mps),
+                recent_estimate_minus_imu_velocity_world_xy_mps=(0.0, estimate_only_mps),
             )
             state = remembering(state, dead_reckoning=beside)
         alive = {name: value + 1e-6 * (round(100 * t_s) % 7) for name, value in tel.items()}
@@ -525,7 +529,10 @@ def gains_beside(
 
 @pytest.mark.parametrize(
     "estimate_only_mps",
-    [0.9 * MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS, 1.1 * MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS],
+    [
+        0.9 * MAX_RECENT_ESTIMATE_MINUS_IMU_VELOCITY_MPS,
+        1.1 * MAX_RECENT_ESTIMATE_MINUS_IMU_VELOCITY_MPS,
+    ],
 )
 def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
     estimate_only_mps: float,
@@ -533,12 +540,12 @@ def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
     """It would follow them to its end: 15 m aside within six seconds, where they are mirrored."""
     begin = remembering(
         state_in(Phase.LANDING),
-        stop_or_land_command_count=MIN_LANDING_COMMAND_COUNT,
+        stop_or_land_command_count=MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION,
         last_stop_or_land_command_at_s=BEGIN_S,
     )
     state, command = gains_beside(begin, -estimate_only_mps, 0.2)
     assert state.belief.is_position_diverged is (
-        estimate_only_mps > MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS
+        estimate_only_mps > MAX_RECENT_ESTIMATE_MINUS_IMU_VELOCITY_MPS
     )
     assert isinstance(command, RawThrust) is state.belief.is_position_diverged
 
@@ -548,4 +555,4 @@ def test_a_tilt_that_wrong_positions_have_turned_is_taken_off_the_reckoned_motio
     not, and what is reckoned by it would brake a speed that is none."""
     state, _ = gains_beside(state_in(Phase.ALIGN), 0.3, 1.5, roll_rad=-0.05)
     assert state.transition_name == "position-astray"
-    assert abs(state.belief.dead_reckoning.velocity_mps[1]) < 0.15
+    assert abs(state.belief.dead_reckoning.velocity_world_mps[1]) < 0.15

@@ -27,10 +27,10 @@ from perchctl.mission.phase import PRE_LANDING_PHASES, Severity
 from perchctl.mission.phases.align import ALIGNED
 from perchctl.mission.table import (
     TABLE,
-    TRANSITIONS_ALLOWED_FOR_OWN_ROWS,
+    TRANSITIONS_ALLOWED_FOR_USER_ROWS,
     Transition,
     add_rows,
-    first_transition,
+    find_first_matching_transition,
     load_table,
 )
 from perchctl.vehicle import (
@@ -402,7 +402,7 @@ def test_what_kept_a_vehicle_from_being_steady_is_named() -> None:
         state_in(P.RECOVER), entered_s=0.0, setpoint=PositionSetpoint(x_m + 0.31, y_m, z_m, 0.0)
     )
     context = context_at(state, sample, PROFILE)
-    row = first_transition(context, TABLE)
+    row = find_first_matching_transition(context, TABLE)
     assert row is not None
     text = row.reason_text(context)
     assert text.startswith("not steady 6 s after the attempt: moving at 0.30 m/s, 0.31 m")
@@ -421,9 +421,9 @@ def test_no_row_undoes_a_landing() -> None:
     """Whatever a table says: from a landing nothing leads back into the flight."""
     landing = remembering(state_in(P.LANDING), severity=Severity.LAND, stop_or_land_command_count=1)
     context = context_at(landing, observation(BEGIN_S), PROFILE)
-    assert first_transition(context, (ROGUE,)) is None
+    assert find_first_matching_transition(context, (ROGUE,)) is None
     flying = context_at(state_in(P.ALIGN), observation(BEGIN_S), PROFILE)
-    assert first_transition(flying, (ROGUE,)) is ROGUE
+    assert find_first_matching_transition(flying, (ROGUE,)) is ROGUE
 
 
 # --- Your own rows ------------------------------------------------
@@ -442,7 +442,7 @@ def test_a_row_of_your_own_comes_after_every_safety_row() -> None:
     assert table[at].outcome is Outcome.SAFETY
     stopped = replace(observation(BEGIN_S), operator_request=OperatorRequest.LAND)
     for obs, name in ((observation(BEGIN_S), "mine"), (stopped, "operator-land")):
-        row = first_transition(context_at(state_in(P.ALIGN), obs, PROFILE), table)
+        row = find_first_matching_transition(context_at(state_in(P.ALIGN), obs, PROFILE), table)
         assert row is not None
         assert row.name == name
 
@@ -455,17 +455,17 @@ def test_the_phases_of_a_row_cannot_grow_in_flight() -> None:
 
 
 def test_no_row_of_your_own_may_climb_stop_or_prove() -> None:
-    assert {to for _, to, _ in TRANSITIONS_ALLOWED_FOR_OWN_ROWS} == {
+    assert {to for _, to, _ in TRANSITIONS_ALLOWED_FOR_USER_ROWS} == {
         P.SEARCH,
         P.ALIGN,
         P.RECOVER,
         P.LANDING,
     }
-    assert all(how >= Severity.HOLD for *_, how in TRANSITIONS_ALLOWED_FOR_OWN_ROWS)
-    assert [at for at, to, _ in TRANSITIONS_ALLOWED_FOR_OWN_ROWS if at is to] == [
+    assert all(how >= Severity.HOLD for *_, how in TRANSITIONS_ALLOWED_FOR_USER_ROWS)
+    assert [at for at, to, _ in TRANSITIONS_ALLOWED_FOR_USER_ROWS if at is to] == [
         P.ALIGN
     ]  # where it waits
-    assert {at for at, _, _ in TRANSITIONS_ALLOWED_FOR_OWN_ROWS} == PRE_LANDING_PHASES - {
+    assert {at for at, _, _ in TRANSITIONS_ALLOWED_FOR_USER_ROWS} == PRE_LANDING_PHASES - {
         P.COMPLETE
     }
 

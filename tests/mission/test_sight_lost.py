@@ -27,7 +27,7 @@ from perchctl.mission.level_descent import (
 from perchctl.mission.phase import Severity
 from perchctl.mission.planner import step_mission
 from perchctl.mission.release import MAX_BRAKED_LATERAL_SPEED_MPS, ONBOARD_POSITION_GAIN_PER_S
-from perchctl.mission.setpoints import MIN_HELD_SETPOINT_HEIGHT_M
+from perchctl.mission.setpoints import MIN_HELD_SETPOINT_HEIGHT_ABOVE_GROUND_M
 from perchctl.vehicle import PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import BY_TARGET as PROFILE
 from tests.helpers.mission import (
@@ -65,7 +65,9 @@ def blinded(
     z_m: float, velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0), **changes: object
 ) -> PlannerState:
     """On its way down by accelerometer and attitude alone, with that reckoned speed."""
-    dead_reckoning = DeadReckoning(imu=ImuMotion(t_s=BEGIN_S), velocity_mps=velocity_mps)
+    dead_reckoning = DeadReckoning(
+        imu_at_last_update=ImuMotion(t_s=BEGIN_S), velocity_world_mps=velocity_mps
+    )
     state = remembering(
         state_in(Phase.LANDING, z_m=z_m), dead_reckoning_began_at_s=BEGIN_S,
         dead_reckoned_height_m=z_m, severity=Severity.LAND, dead_reckoning=dead_reckoning,
@@ -97,7 +99,7 @@ def test_it_is_held_then_sinks_and_then_comes_down_level(phase: Phase) -> None:
     assert all(after <= before for before, after in pairwise(blind_m))
     assert blind_m[-1] < blind_m[0]
     assert flight.state.transition_name == "position-lost"
-    assert "descending level" in flight.state.reason
+    assert "descending level" in flight.state.transition_reason
 
 
 @pytest.mark.parametrize(
@@ -117,7 +119,7 @@ def test_what_sightings_contradict_is_not_flown_by(
     )
     state = fly(state_in(Phase.ALIGN), seen, profile=PROFILE).state
     assert (state.phase is Phase.LANDING) is lands
-    assert ("from its estimate" in state.reason) is lands
+    assert ("from its estimate" in state.transition_reason) is lands
 
 
 @given(age_s=st.floats(0.0, 1.4), z_m=st.floats(0.3, 2.0), phase=st.sampled_from(IN_THE_AIR))
@@ -132,12 +134,12 @@ def test_nothing_climbs_without_a_sight(age_s: float, z_m: float, phase: Phase) 
 
 def test_sinking_ends_above_the_floor() -> None:
     state = lost(
-        state_in(Phase.ALIGN, z_m=MIN_HELD_SETPOINT_HEIGHT_M + 0.05),
+        state_in(Phase.ALIGN, z_m=MIN_HELD_SETPOINT_HEIGHT_ABOVE_GROUND_M + 0.05),
         LAND_S - 0.1,
-        MIN_HELD_SETPOINT_HEIGHT_M + 0.05,
+        MIN_HELD_SETPOINT_HEIGHT_ABOVE_GROUND_M + 0.05,
     ).state
     assert state.setpoint is not None
-    assert state.setpoint.z_m == pytest.approx(MIN_HELD_SETPOINT_HEIGHT_M)
+    assert state.setpoint.z_m == pytest.approx(MIN_HELD_SETPOINT_HEIGHT_ABOVE_GROUND_M)
 
 
 @given(
@@ -233,8 +235,8 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
         weight_transfer_began_at_s=BEGIN_S - 1.0,
         magnet_reach_entered_at_s=BEGIN_S - 6.0, dead_reckoning_began_at_s=BEGIN_S - 3.0,
         dead_reckoning=DeadReckoning(
-            imu=imu, velocity_mps=(x_mps, y_mps, -0.5),
-            lateral_velocity_missed_by_estimate_mps=(x_mps, y_mps),
+            imu_at_last_update=imu, velocity_world_mps=(x_mps, y_mps, -0.5),
+            recent_imu_minus_estimate_velocity_world_xy_mps=(x_mps, y_mps),
         ),
     )  # fmt: skip
     falls = unseen(1.85, for_s=2.0, velocity_mps=(0.0, 0.0, -0.5), acc_z_g=0.2, thrust=0.0)
@@ -283,7 +285,7 @@ def test_a_press_without_a_contact_backs_off_before_dead_reckoning_leads_aside()
     ]
     assert rows[0] == "pressed-blindly"
     assert flight.state.failed_attempts == 1
-    assert "after the last sight" in flight.state.reason
+    assert "after the last sight" in flight.state.transition_reason
     decks = fly(state_in(Phase.PERCH, z_m=2.1), unseen(2.1, for_s=1.3))
     assert decks.state.transition_name != "pressed-blindly"
 

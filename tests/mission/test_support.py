@@ -33,7 +33,7 @@ def supported(obs: Observation, phase: Phase = Phase.ALIGN) -> Support:
     """What the planner believes after one tick with `obs`, while it does not climb."""
     state, _ = step_mission(state_in(phase, T_S, obs.telemetry.position_m[2]), obs, PROFILE)
     assert state.phase is phase
-    return Context(state).support
+    return Context(state).vehicle_support
 
 
 def hanging(
@@ -97,7 +97,7 @@ def test_a_maneuver_that_has_just_begun_knows_nothing_yet() -> None:
     """Its evidence starts anew; a vehicle that hangs does not fly for that."""
     state, _ = step_mission(state_in(Phase.ASCEND, T_S, HANG_Z_M), hanging(0.2), PROFILE)
     assert state.phase is Phase.ALIGN
-    assert Context(state).support is Support.UNKNOWN
+    assert Context(state).vehicle_support is Support.UNKNOWN
 
 
 def test_a_vehicle_with_late_telemetry_is_supported_by_nothing_known() -> None:
@@ -118,4 +118,4 @@ def test_a_vehicle_that_has_come_down_and_cannot_fly_stands_on_the_floor() -> No
         hanging(0.0, below_m=HANG_Z_M - 0.02),
         PROFILE,
     )
-    assert Context(state).support is Support.FLOOR
+    assert Context(state).vehicle_support is Support.FLOOR

@@ -24,7 +24,10 @@ from perchctl.mission.belief.contact import (
     SLOW_AT_NEARLY_FULL_THRUST,
 )
 from perchctl.mission.phase import PRE_LANDING_PHASES
-from perchctl.mission.setpoints import MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M, limit_setpoint
+from perchctl.mission.setpoints import (
+    MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M,
+    limit_setpoint_to_fence_and_height,
+)
 from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST, Command, PositionSetpoint
 from tests.helpers.mission import (
@@ -128,7 +131,7 @@ def test_a_press_that_could_not_press_is_not_begun(hover: float, presses: bool) 
     assert state.phase is (Phase.PERCH if presses else Phase.LANDING)
     if not presses:
         assert state.outcome is Outcome.SAFETY
-        assert "too heavy" in state.reason
+        assert "too heavy" in state.transition_reason
 
 
 @pytest.mark.parametrize(("hover", "lasts_s", "row"), [
@@ -141,7 +144,7 @@ def test_a_weak_vehicle_at_full_thrust_is_not_called_pressed(
     start = remembering(state_in(Phase.ALIGN), hover_thrust=hover)
     state = flown(start, lasts_s, thrust=float(FULL_THRUST), setpoint_z_m=1.2, lateral_offset_m=0.2)
     assert state.transition_name == row
-    assert row != "too-weak" or "battery too low" in state.reason
+    assert row != "too-weak" or "battery too low" in state.transition_reason
 
 
 def flown_at_full_thrust(
@@ -287,7 +290,7 @@ def test_no_setpoint_lies_in_the_ground(z_m: float, phase: Phase) -> None:
     state = remembering(state_in(phase), takeoff_position_m=(0.0, 0.0, GROUND_Z_M))
     c = context_at(state, observation(10.02), PROFILE)
     lowest = GROUND_Z_M + (0.0 if phase is Phase.APPROACH else MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M)
-    sent = limit_setpoint(c, PositionSetpoint(0.0, 0.0, z_m, 0.0)).z_m
+    sent = limit_setpoint_to_fence_and_height(c, PositionSetpoint(0.0, 0.0, z_m, 0.0)).z_m
     assert sent >= lowest
     assert sent == z_m or z_m < lowest or z_m > GROUND_Z_M + PROFILE.safety.max_height_m
 

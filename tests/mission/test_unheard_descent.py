@@ -233,7 +233,7 @@ def test_a_loop_that_stood_still_takes_the_vehicle_for_no_floor(begin_s: float) 
 def test_a_thrust_that_was_too_small_before_the_descent_proves_no_floor() -> None:
     vehicle = Falling(1.5, 0.0, 1.0)
     seen = seen_before(vehicle)
-    come_down(vehicle, 8.0, visual_motion=seen, too_weak_to_fly_since_s=BEGIN_S - 3.0)
+    come_down(vehicle, 8.0, visual_motion=seen, thrust_too_low_to_fly_since_s=BEGIN_S - 3.0)
     assert vehicle.touched_mps is not None
     assert -0.75 < vehicle.touched_mps < 0.0
 

@@ -279,7 +279,7 @@ def test_what_has_not_come_down_hangs_where_the_target_is(
     begin = landing(z_m, stop_or_land_command_count=3, last_stop_or_land_command_at_s=9.9)
     state = fly(begin, at(z_m, obs={"target": target}, **OFF), 2.4).state
     assert state.phase is ends
-    assert words in state.reason
+    assert words in state.transition_reason
 
 
 # --- What something holds ------------------------------------------------------------------------

@@ -146,7 +146,7 @@ def test_frames_before_the_first_tick_are_kept_and_repetitions_are_not(tmp_path:
     recorder, flight = recorded.recorder(tmp_path / "f.mcap"), recorded.flown(8)
     for frame in flight.frames:
         recorder.write_frame(frame)
-    recorder.write_frame(replace(flight.frames[-1], repeated=True))
+    recorder.write_frame(replace(flight.frames[-1], is_repeated=True))
     assert recorder.close().pictures == 8
     found = recorded.messages(tmp_path / "f.mcap")
     assert (len(found["/camera/image"]), len(found["/camera/frame"])) == (8, 9)

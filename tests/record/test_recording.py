@@ -47,7 +47,7 @@ def test_each_picture_is_the_pipeline_s_to_the_bit(recording: Path) -> None:
     assert [picture.number for picture in some] == [3, 40]  # by the log's name, and no others
     stored = recorded.messages(recording)["/camera/image"]
     assert [image.format for image in stored[:4]] == ["jpeg", "png", "jpeg", "png"]
-    assert stored[0].data == FLIGHT.frames[0].encoded  # a JPEG lies there as it came
+    assert stored[0].data == FLIGHT.frames[0].source_jpeg  # a JPEG lies there as it came
 
 
 def test_no_recording_and_none_of_ours(tmp_path: Path) -> None:

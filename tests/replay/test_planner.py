@@ -90,7 +90,7 @@ def test_a_changed_word_of_the_planner_is_named_by_tick_and_field(
 
     def says_otherwise(state: Any, obs: Any, profile: Any, table: Any) -> Any:
         new, command = step(state, obs, profile, table)
-        entry = replace(new.entry, reason=new.reason.replace("hovering", "hanging"))
+        entry = replace(new.entry, reason=new.transition_reason.replace("hovering", "hanging"))
         return replace(new, entry=entry), command
 
     log, old = logs("hung"), logs("perched")

@@ -37,7 +37,7 @@ class Kept:
             index, _, image = self.pictures[-1]
             again = image.copy()
             again[0, 0] ^= np.uint8(frame.index % 2)
-            return replace(frame, index=index, image=again, repeated=True)
+            return replace(frame, index=index, image=again, is_repeated=True)
         self.pictures.append((frame.index, frame.t_s, frame.image))
         return frame
 

@@ -21,7 +21,7 @@ from perchctl.vision import (
 )
 from perchctl.vision.fields import deinterlace_frame, interpolate_field, is_combed
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.types import FieldState
+from perchctl.vision.types import InterlacingState
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -85,7 +85,7 @@ def test_noise_and_snow_and_nothing_are_not_combed() -> None:
 # --- Order and time ----------------------------------------------------------------------------
 
 
-def kinds(state: FieldState, frames: list[Frame]) -> list[Any]:
+def kinds(state: InterlacingState, frames: list[Frame]) -> list[Any]:
     found = []
     for frame in frames:
         state, parts = deinterlace_frame(state, frame)
@@ -108,7 +108,7 @@ def test_the_order_is_found_within_a_few_frames(
 ) -> None:
     """Motion along the columns too, where a row of the one field lies between two of the other."""
     scene = Pass(0.25, velocity_mps, turn_radps=0.0, camera_fields=first)
-    found = kinds(FieldState(), list(scene.frames(6)))
+    found = kinds(InterlacingState(), list(scene.frames(6)))
     second = "bottom" if first == "top" else "top"
     assert found[0] == ("woven",)
     assert found[5] == (first, second)
@@ -120,7 +120,7 @@ def test_a_changed_order_is_found() -> None:
     _, tops = woven_frames(5, "top")
     _, bottoms = woven_frames(12, "bottom")
     later = [replace(frame, t_s=frame.t_s + 1.0) for frame in bottoms]
-    found = kinds(FieldState(), tops + later)
+    found = kinds(InterlacingState(), tops + later)
     assert found[4] == ("top", "bottom")
     assert found[-1] == ("bottom", "top")
 
@@ -132,7 +132,7 @@ def test_fields_are_half_a_period_apart(period_s: float, apart_s: float) -> None
     """Found from times that jitter, of frames of which some are lost."""
     rng = np.random.default_rng(6)
     _, frames = woven_frames(3)
-    state = FieldState(is_top_field_first=True)
+    state = InterlacingState(is_top_field_first=True)
     index = 0
     for k in range(40):
         index += 1 + (rng.random() < 0.1)

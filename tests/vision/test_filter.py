@@ -17,10 +17,10 @@ from perchctl.geometry import Array, make_T, rot_z, rotation_from_rpy, wrap_rad
 from perchctl.profile import KalmanConfig, TargetConfig
 from perchctl.vision import MarkerPose, Pipeline, PipelineState, VehicleState
 from perchctl.vision.filter import (
-    MEASURED,
+    MEASURED_ELEMENTS,
     POSITION,
-    RATES,
-    TILTS,
+    RATE_ELEMENTS,
+    TILT_BIASES,
     VELOCITY,
     VX,
     YAW,
@@ -33,14 +33,14 @@ from perchctl.vision.filter import (
     start_track,
     step_track,
 )
-from perchctl.vision.pipeline import step_detections
+from perchctl.vision.pipeline import step_from_detections
 from perchctl.vision.target_selection import make_track_measurement
 from perchctl.vision.types import MarkerTrack
 from tests.helpers.seen import seen_from
 
 CONFIG = KalmanConfig(noise="fixed")
 SETUP = make_filter_setup(CONFIG)
-H = np.eye(8)[MEASURED]
+H = np.eye(8)[MEASURED_ELEMENTS]
 
 
 def test_gains_are_the_papers_units_in_si() -> None:
@@ -106,11 +106,11 @@ def test_yaw_follows_across_the_wrap(start: float, rate: float) -> None:
 
 def test_velocities_decay_and_the_track_is_dropped_after_n_max() -> None:
     track: MarkerTrack | None = MarkerTrack(0.0, np.arange(8) / 10.0, np.eye(8) * 1e-4, 0)
-    rates, position = track.x[RATES].copy(), track.x[POSITION].copy()
+    rates, position = track.x[RATE_ELEMENTS].copy(), track.x[POSITION].copy()
     for n in range(1, CONFIG.n_max + 1):
         track = step_track(track, None, n / 30, SETUP)
         assert track.unseen_frames == n
-        assert np.allclose(track.x[RATES], rates * CONFIG.alpha**n)
+        assert np.allclose(track.x[RATE_ELEMENTS], rates * CONFIG.alpha**n)
         position = position + track.x[VELOCITY] / 30
         assert np.allclose(track.x[POSITION], position)
     assert step_track(track, None, (CONFIG.n_max + 1) / 30, SETUP) is None
@@ -162,8 +162,8 @@ def test_a_jump_beyond_the_motion_model_teaches_a_camera_no_speed(
         track = step_track(track, TrackMeasurement(place + k * steps, R), k / 30.0, setup)
     jumped = place + 20 * steps + jump
     track = step_track(track, TrackMeasurement(jumped, R), 20 / 30.0, setup)
-    assert np.allclose(track.x[MEASURED], jumped)
-    assert np.abs(track.x[RATES]).max() == 0.0
+    assert np.allclose(track.x[MEASURED_ELEMENTS], jumped)
+    assert np.abs(track.x[RATE_ELEMENTS]).max() == 0.0
     sigma_m = np.sqrt(track.P.diagonal()[POSITION])
     assert (sigma_m > 0.9 * np.abs(jump_m) - 0.01).all()
     confirmed = step_track(track, TrackMeasurement(jumped + steps, R), 21 / 30.0, setup)
@@ -173,7 +173,7 @@ def test_a_jump_beyond_the_motion_model_teaches_a_camera_no_speed(
     for k in range(20):
         there = step_track(there, TrackMeasurement(place, R), k / 30.0, world)
     there = step_track(there, TrackMeasurement(place + jump, R), 20 / 30.0, world)
-    assert not np.allclose(there.x[MEASURED], place + jump)
+    assert not np.allclose(there.x[MEASURED_ELEMENTS], place + jump)
 
 
 # --- What the filter claims is what it errs by, and it errs no more than each frame alone ------
@@ -210,7 +210,7 @@ def errors(setup: Pipeline, in_world: bool, bias_rad: float, scale: float) -> Ar
                 here = (float(position[0]), float(position[1]), float(position[2]))
                 attitude = VehicleState(k / HZ, roll + bias_rad, pitch - bias_rad, yaw, here)
             seen = seen_from(T, TARGET_M, k / HZ, rng, scale=scale)
-            state, output = step_detections(state, seen, attitude, setup)
+            state, output = step_from_detections(state, seen, attitude, setup)
             target, pose = output.target, next(iter(output.poses.values()), None)
             if target is None or pose is None:
                 continue
@@ -281,7 +281,7 @@ def test_the_consider_term_is_what_a_wrong_attitude_does(
             xyz_yaw_cov=1e-6 * np.eye(4),
         )  # fmt: skip
         found = make_track_measurement(pose, attitude, in_world, constants, setup.pose_setup)
-        return found.z, found.yaw_xyz_shift_per_bias_sigma[:, TILTS]
+        return found.z, found.yaw_xyz_shift_per_bias_sigma[:, TILT_BIASES]
 
     (z, tilt), (moved, _) = measured(true), measured(wrong)
     expected = tilt @ np.array(bias_rad) / math.radians(0.3)

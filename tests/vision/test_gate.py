@@ -23,14 +23,14 @@ from perchctl.vision import (
     estimate,
 )
 from perchctl.vision.filter import TrackMeasurement, X, make_filter_setup
-from perchctl.vision.pipeline import step_detections
+from perchctl.vision.pipeline import step_from_detections
 from perchctl.vision.tracks import (
     LOCK_TIMEOUT_S,
     MIN_ESTABLISHED_LOCK_FRAMES,
     MIN_RIVAL_ALONE_IN_VIEW_DURATION_S,
-    REACQUIRE_S,
+    MIN_RIVAL_DURATION_TO_LOCK_S,
     FramePose,
-    _is_clearly_consistent,
+    _is_pose_clearly_consistent,
     judge_pose,
 )
 from perchctl.vision.types import Detections, MarkerTrack, RivalTrack, TargetLock
@@ -71,7 +71,7 @@ class Watch:
                 jx, jy, jz = self.jumped_m
                 here = (x + jx, y + jy, z + jz)
                 self.attitude = VehicleState(t, 0.02 * np.sin(2 * t), 0.0, yaw, here)
-            self.state, output = step_detections(self.state, seen, self.attitude, self.setup)
+            self.state, output = step_from_detections(self.state, seen, self.attitude, self.setup)
             outputs.append(output)
             self.k += 1
         return outputs
@@ -173,7 +173,7 @@ def test_what_is_clearly_the_targets_is_so_by_every_spread(
         accepted_frame_count=9,
         has_shown_both_markers=True,
     )
-    if _is_clearly_consistent(track, sight, constants):
+    if _is_pose_clearly_consistent(track, sight, constants):
         assert judge_pose(lock, rival, sight, constants).is_accepted
 
 
@@ -192,7 +192,7 @@ def test_a_pose_that_fits_the_track_before_the_last_one_is_the_targets(
     lock = TargetLock(track, replace(pose, e_m=np.full(3, 5.0)), in_world, 9, True, before)
     verdict = judge_pose(lock, None, sight, make_filter_setup(KalmanConfig(), in_world))
     assert verdict.is_accepted is (x_m == -0.02 and not in_world)
-    assert verdict.restarts_at_locked_target is verdict.is_accepted
+    assert verdict.keeps_lock_at_restart is verdict.is_accepted
     again = TargetLock(track, lock.pose, in_world, 9, True)  # as long as nothing is known of before
     assert not judge_pose(
         again, None, sight, make_filter_setup(KalmanConfig(), in_world)
@@ -207,7 +207,7 @@ def test_without_the_gate_all_of_them_steer(build: Build) -> None:
 
 def test_a_target_that_moved_is_taken_up_anew_after_a_while(watch: Watch) -> None:
     watch.show(LOCKED)
-    while_s = REACQUIRE_S if watch.in_world else MIN_RIVAL_ALONE_IN_VIEW_DURATION_S
+    while_s = MIN_RIVAL_DURATION_TO_LOCK_S if watch.in_world else MIN_RIVAL_ALONE_IN_VIEW_DURATION_S
     outputs = watch.show(int(1.2 * while_s * HZ) + 2, away_m=(0.3, 0.0, 0.0))
     first = measured(outputs).index(True)
     assert while_s * HZ - 1 <= first <= while_s * HZ + 2
@@ -232,8 +232,8 @@ def test_a_second_target_seen_beside_the_first_takes_no_camera_alone_soon(build:
     for _ in range(3):
         assert not any(measured(watch.show(2, away_m=(0.3, 0.0, 0.0))))
         assert all(measured(watch.show(2)))
-    outputs = watch.show(int(1.2 * REACQUIRE_S * HZ), away_m=(0.3, 0.0, 0.0))
-    assert measured(outputs).index(True) >= REACQUIRE_S * HZ - 2
+    outputs = watch.show(int(1.2 * MIN_RIVAL_DURATION_TO_LOCK_S * HZ), away_m=(0.3, 0.0, 0.0))
+    assert measured(outputs).index(True) >= MIN_RIVAL_DURATION_TO_LOCK_S * HZ - 2
 
 
 def test_no_jump_locks_the_pipeline_out_for_ever(watch: Watch) -> None:
@@ -333,7 +333,9 @@ def test_a_lock_of_a_moment_gives_way_to_what_lasts(watch: Watch) -> None:
 
 def test_a_lone_marker_never_moves_an_established_lock(watch: Watch) -> None:
     watch.show(LOCKED)
-    outputs = watch.show(int(2.0 * REACQUIRE_S * HZ), markers=("large",), away_m=(0.3, 0.0, 0.0))
+    outputs = watch.show(
+        int(2.0 * MIN_RIVAL_DURATION_TO_LOCK_S * HZ), markers=("large",), away_m=(0.3, 0.0, 0.0)
+    )
     assert not any(measured(outputs))
 
 
@@ -353,5 +355,5 @@ def test_of_two_targets_in_view_one_is_told(build: Build) -> None:
     watch.show(LOCKED)
     T = make_T(rot_z(0.0), TARGET_M - [0.0, 0.0, RANGE_M])
     seen = seen_from(T, TARGET_M, watch.k / HZ, watch.rng)
-    _, output = step_detections(watch.state, replace(seen, target_count=2), None, watch.setup)
+    _, output = step_from_detections(watch.state, replace(seen, target_count=2), None, watch.setup)
     assert "more than one target in view" in output.lock_note

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from perchctl.geometry import Array, make_T, rot_z, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.vision import MARKERS, Pipeline, PipelineState, VehicleState
-from perchctl.vision.pipeline import step_detections
+from perchctl.vision.pipeline import step_from_detections
 from perchctl.vision.tracks import MIN_RIVAL_ALONE_IN_VIEW_DURATION_S
 from tests.helpers.seen import seen_from
 
@@ -108,7 +108,7 @@ def claims(setup: Pipeline, scene: Scene, in_flight: bool) -> list[Claim]:
         seen = seen_from(T, shown_m, t_s, rng, markers=scene.markers, sigma_px=scene.sigma_px)
         if len(seen.markers) < len(scene.markers) or shown_m[2] - camera_m[2] < NEAREST_M:
             return []
-        state, output = step_detections(state, seen, attitude, setup)
+        state, output = step_from_detections(state, seen, attitude, setup)
         if k < before:
             continue
         found = output.target
@@ -200,7 +200,7 @@ def test_an_estimate_that_jumps_leaves_the_target_where_the_picture_has_it(
 def test_a_target_that_moves_in_flight_is_nowhere_with_confidence(
     build: Build, scene: Scene
 ) -> None:
-    """Whether it moved or another one is seen takes `REACQUIRE_S` to decide."""
+    """Whether it moved or another one is seen takes `MIN_RIVAL_DURATION_TO_LOCK_S` to decide."""
     told = claims(build(), scene, in_flight=True)
     assume(told)
     assert longest_false_s(told, scene.hz) <= 0.1

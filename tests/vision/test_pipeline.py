@@ -320,7 +320,7 @@ def errors_px(flight: Flight, frames: int, *, told: bool = True) -> Iterator[flo
             attitude = replace(attitude, velocity_mps=None)
         if sight is not None:
             expected, _ = predict_corners(sight, pose.t_s, attitude, SETUP)
-            points = SETUP.corners_m["large"]
+            points = SETUP.marker_corners_m["large"]
             true = cv2.projectPoints(points, pose.rvec_rad, pose.tvec_m, CAMERA.K, CAMERA.dist)[0]
             yield float(np.abs(expected["large"] - true.reshape(4, 2)).max())
         sight = update_last_pose(sight, pose, attitude, SETUP)

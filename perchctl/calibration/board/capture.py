@@ -212,7 +212,7 @@ def capture_views(
                 break
             if frame is None:
                 continue
-            if frame.repeated:  # a repeated frame would make the board seem to be still
+            if frame.is_repeated:  # a repeated frame would make the board seem to be still
                 capture.count_repeated()
                 continue
             seen = find_board(frame.image, board, f"view {len(capture.taken) + 1}")

@@ -69,7 +69,8 @@ def record_mounting(
             continue
         poses = reader.read_poses(frame)
         progress.advance_time(frame.t_s if not source.live else now_s)
-        if frame.repeated and not reader.trouble:  # an image without a target is treated as missing
+        # An image without a target is treated as missing.
+        if frame.is_repeated and not reader.trouble:
             continue
         recording.poses += poses
         recording.mirrored_pictures = reader.mirrored

@@ -209,12 +209,12 @@ def update_battery_fit(
     state: BatteryFit,
     dt_s: float,
     battery_v: float,
-    thrust: float,
+    raw_thrust: float,
     battery_capacity_mah: float,
     power_train: PowerTrain,
 ) -> BatteryFit:
     """Return the fit `dt_s` later, after the voltage reading `battery_v`, V, at the commanded
-    thrust `thrust` (0..65535), for a battery with the full charge `battery_capacity_mah`.
+    thrust `raw_thrust` (0..65535), for a battery with the full charge `battery_capacity_mah`.
 
     Before the first load, a reading without thrust is the resting voltage. Under load, the resting
     voltage is the reading plus the fitted sag, passed through a low-pass filter, and the reading is
@@ -222,7 +222,7 @@ def update_battery_fit(
     `battery_v` that is NaN or outside the range of a cell counts as missing: the resting voltage
     then falls by the charge that the thrust is calculated to consume.
     """
-    thrust_fraction = max(0.0, min(1.0, thrust / FULL_THRUST))
+    thrust_fraction = max(0.0, min(1.0, raw_thrust / FULL_THRUST))
     state = replace(
         state,
         coulomb_counted_discharge_fraction=state.coulomb_counted_discharge_fraction

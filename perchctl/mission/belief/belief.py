@@ -279,7 +279,7 @@ class Belief:
     def is_estimate_missing_gust(self) -> bool:
         """True after an impact or gust that only the accelerometer has measured, until a sighting
         corrects the estimate. The firmware's estimator ignores lateral forces."""
-        is_reckoned = self.dead_reckoning.imu is not None
+        is_reckoned = self.dead_reckoning.imu_at_last_update is not None
         if not (
             self.is_target_position_source
             and is_reckoned
@@ -290,7 +290,10 @@ class Belief:
             MIN_SPEED_GAINED_IN_GUST_MPS
             + GUST_SPEED_THRESHOLD_PER_LATENCY_SIGMA_MPS2 * self.obs.camera_latency_sigma_s
         )
-        return math.hypot(*self.dead_reckoning.lateral_velocity_missed_by_estimate_mps) > least_mps
+        return (
+            math.hypot(*self.dead_reckoning.recent_imu_minus_estimate_velocity_world_xy_mps)
+            > least_mps
+        )
 
     @cached_property
     def is_flight_data_unreliable(self) -> bool:
@@ -414,11 +417,11 @@ class Belief:
         """Vertical speed, m/s, positive upwards. It comes from the state estimate while the
         position is valid. Otherwise, or once dead reckoning has replaced the estimate, it comes
         from the accelerometer and drifts."""
-        is_reckoned = self.dead_reckoning.imu is not None
+        is_reckoned = self.dead_reckoning.imu_at_last_update is not None
         if is_reckoned and (
             self.dead_reckoning_began_at_s is not None or not self.is_position_valid
         ):
-            return self.dead_reckoning.velocity_mps[2]
+            return self.dead_reckoning.velocity_world_mps[2]
         return self.obs.telemetry.velocity_mps[2]
 
     def is_sinking(self, min_sink_mps: float) -> bool:

@@ -181,7 +181,7 @@ def _dead_reckoned_gear_to_target(b: Belief) -> GearToTargetDistance:
     sigma_m = math.hypot(
         dead_reckoning.gear_to_target_sigma_m,
         GEAR_DISPLACEMENT_BY_TOUCH_SIGMA_M,
-        *dead_reckoning.unexplained_position_step_sum_xy_m,
+        *dead_reckoning.unexplained_position_step_sum_world_xy_m,
     )
     if b.profile.positioning.source.is_deck and b.is_position_valid:
         sigma_m = math.hypot(
@@ -302,7 +302,7 @@ def is_thrust_above_hover(b: Belief) -> bool:
     most = MIN_SATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
     if (
         b.command_history.maneuver.presses_against_target
-        and b.command_history.raw_thrust is not None
+        and b.command_history.commanded_raw_thrust is not None
     ):
         most = MIN_REPORTED_TO_COMMANDED_PRESS_THRUST_RATIO * max_press_thrust(b.profile)
     least = (
@@ -422,7 +422,7 @@ def _is_hanging(b: Belief) -> bool:
     stayed = (
         b.command_history.maneuver_start_position_m[2] - tel.position_m[2]
         < MAX_HEIGHT_LOSS_IF_HELD_AT_DESCENT_START_M
-        and not b.target.is_far_above
+        and not b.target.is_too_far_above_to_hold_vehicle
     )
     return held and (at_contact or at_target or stayed)
 
@@ -439,7 +439,7 @@ def _are_motors_off(b: Belief) -> bool:
 
 
 def _is_raw_thrust_commanded(b: Belief) -> bool:
-    return (b.command_history.raw_thrust or 0) > 0
+    return (b.command_history.commanded_raw_thrust or 0) > 0
 
 
 def _are_motors_off_as_commanded(b: Belief) -> bool:

@@ -62,7 +62,7 @@ class CommandHistory:
     maneuver: Maneuver
     maneuver_start_position_m: Vector = (0.0, 0.0, 0.0)  # position where the maneuver began
     setpoint: PositionSetpoint | None = None
-    raw_thrust: int | None = None  # last command; None in position mode
+    commanded_raw_thrust: int | None = None  # last command; None in position mode
     weight_transfer_began_at_s: float | None = None  # start of the transfer by raw thrust
     motor_stop_commanded_at_s: float | None = None  # first command to stop the motors
     # time at which a descent by raw thrust detected the floor
@@ -73,7 +73,7 @@ class CommandHistory:
         """True while the vehicle descends by raw thrust with its motors turning."""
         return (
             self.maneuver.descends_to_floor
-            and self.raw_thrust is not None
+            and self.commanded_raw_thrust is not None
             and self.is_before_weight_transfer_and_motor_stop
         )
 

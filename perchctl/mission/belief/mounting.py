@@ -20,10 +20,13 @@ from perchctl.vehicle import Telemetry
 CAMERA_MOUNTING_CHECK_WINDOW_S = 3.0  # older sightings are dropped because the estimate drifts
 MIN_SIGHTINGS_TO_JUDGE_CAMERA_MOUNTING = 10
 """Number of sightings required to judge the mounting."""
-MIN_JUDGED_MOTION_M, MIN_PROVEN_MOTION_M = 0.12, 0.3
+MIN_UP_AXIS_MOTION_TO_JUDGE_MOUNTING_M, MIN_UP_AXIS_MOTION_TO_CONFIRM_MOUNTING_M = 0.12, 0.3
 """Motion of the vehicle's upward axis, m, above which the mounting is judged, and above which it is
 proven."""
-MAX_STATIONARY_RATIO, MIN_MOVING_RATIO = 0.35, 0.6
+MAX_TARGET_TO_UP_AXIS_MOTION_RATIO_IF_STATIONARY, MIN_TARGET_TO_UP_AXIS_MOTION_RATIO_IF_MOVING = (
+    0.35,
+    0.6,
+)
 """Ratio of the target's apparent motion to the vehicle's motion: below the first value, the target
 is stationary; above the second, it moves with the vehicle. Undisturbed flights show 0.25 at most; a
 camera rotated by a quarter turn shows 1.4."""
@@ -37,10 +40,10 @@ MIN_DETECTED_CAMERA_YAW_ERROR_RAD = math.radians(65.0)
 MIN_CONTRADICTING_SIGHTINGS = 4
 """Number of successive contradicting sightings that prove a wrong mounting. Smaller: single wrong
 poses end the flight."""
-TARGET_JUMPS, JUMP_PAUSE_S = ((0.1, 0.1), (0.15, 0.2)), 0.4
-"""`TARGET_JUMPS` are pairs of a distance, m, and a time, s: a target that moves by more than the
-distance plus twice the vehicle's motion within that time has been moved. `JUMP_PAUSE_S` is the
-pause of the check after a jump, s."""
+TARGET_JUMP_DISTANCES_M_AND_DURATIONS_S, CHECK_PAUSE_AFTER_JUMP_S = ((0.1, 0.1), (0.15, 0.2)), 0.4
+"""`TARGET_JUMP_DISTANCES_M_AND_DURATIONS_S` are pairs of a distance, m, and a time, s: a target
+that moves by more than the distance plus twice the vehicle's motion within that time has been
+moved. `CHECK_PAUSE_AFTER_JUMP_S` is the pause of the check after a jump, s."""
 MIN_ESTIMATE_JUMP_DISTANCE_M = 0.05
 """Motion of the vehicle's estimated position between two sightings above which the state estimate
 has jumped, m; `ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS` times the time between them is added. Larger:
@@ -48,7 +51,9 @@ sightings from before and after a jump are compared."""
 ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS = 1.5
 """Increase of `MIN_ESTIMATE_JUMP_DISTANCE_M` for each second between the sightings, m/s. Smaller:
 the sightings of a fast vehicle are dropped."""
-_MAX_TARGET_JUMP_DURATION_S = max(within_s for _, within_s in TARGET_JUMPS)
+_MAX_TARGET_JUMP_DURATION_S = max(
+    within_s for _, within_s in TARGET_JUMP_DISTANCES_M_AND_DURATIONS_S
+)
 
 
 @dataclass(frozen=True)
@@ -100,7 +105,8 @@ class CameraMountingMonitor:
 
     sightings: tuple[CameraMountingSample, ...] = ()
     check_paused_until_s: float = -math.inf
-    # the target was stationary while the vehicle moved `MIN_PROVEN_MOTION_M`: the check is complete
+    # the target was stationary while the vehicle moved `MIN_UP_AXIS_MOTION_TO_CONFIRM_MOUNTING_M`:
+    # the check is complete
     is_camera_mounting_confirmed: bool = False
     is_target_stationary: bool = False  # the target has been stationary so far
     contradicting_sighting_count: int = 0  # successive sightings that contradict the mounting
@@ -132,14 +138,14 @@ def update_camera_mounting_monitor(
     shows a large rotation of the camera.
 
     Once the mounting is confirmed or found wrong, nothing changes any more. After a jump of the
-    target or of the state estimate, the check starts again and pauses for `JUMP_PAUSE_S`. Sightings
-    older than `CAMERA_MOUNTING_CHECK_WINDOW_S` are dropped.
+    target or of the state estimate, the check starts again and pauses for
+    `CHECK_PAUSE_AFTER_JUMP_S`. Sightings older than `CAMERA_MOUNTING_CHECK_WINDOW_S` are dropped.
     """
     if old.is_camera_mounting_confirmed or old.is_camera_mounting_wrong:
         return old
     kept = tuple(s for s in old.sightings if sample.t_s - s.t_s <= CAMERA_MOUNTING_CHECK_WINDOW_S)
-    if kept and _is_target_or_estimate_jump(kept, sample):
-        return CameraMountingMonitor(check_paused_until_s=sample.t_s + JUMP_PAUSE_S)
+    if kept and _has_target_or_estimate_jumped(kept, sample):
+        return CameraMountingMonitor(check_paused_until_s=sample.t_s + CHECK_PAUSE_AFTER_JUMP_S)
     if sample.t_s < old.check_paused_until_s:
         return old
     new = replace(
@@ -152,7 +158,7 @@ def update_camera_mounting_monitor(
     )
 
 
-def _is_target_or_estimate_jump(
+def _has_target_or_estimate_jumped(
     earlier_samples: tuple[CameraMountingSample, ...], sample: CameraMountingSample
 ) -> bool:
     """True if, since one of `earlier_samples` (oldest first), the vehicle's estimated position has
@@ -171,7 +177,7 @@ def _is_target_or_estimate_jump(
             abs(sample.target_world_xy_m - s.target_world_xy_m),
             abs(sample.up_axis_at_target_height_world_xy_m - s.up_axis_at_target_height_world_xy_m),
         )
-        for jump_m, within_s in TARGET_JUMPS:
+        for jump_m, within_s in TARGET_JUMP_DISTANCES_M_AND_DURATIONS_S:
             if age_s <= within_s and target_m > jump_m + 2.0 * vehicle_m:
                 return True
     return False
@@ -189,22 +195,22 @@ def _judge_camera_mounting(
     )
     n, first = len(aims), aims[0]
     moved_m = max(abs(aim - first) for aim in aims)
-    if moved_m < MIN_JUDGED_MOTION_M:
+    if moved_m < MIN_UP_AXIS_MOTION_TO_JUDGE_MOUNTING_M:
         return monitor
     p0, q0 = sum(aims) / n, sum(targets) / n
     pairs = [(aim - p0, target - q0) for aim, target in zip(aims, targets, strict=True)]
     along = sum(p.conjugate() * q for p, q in pairs) / sum(abs(p) ** 2 for p, _ in pairs)
-    if abs(along) < MAX_STATIONARY_RATIO:
+    if abs(along) < MAX_TARGET_TO_UP_AXIS_MOTION_RATIO_IF_STATIONARY:
         return replace(
             monitor,
-            is_camera_mounting_confirmed=moved_m >= MIN_PROVEN_MOTION_M,
+            is_camera_mounting_confirmed=moved_m >= MIN_UP_AXIS_MOTION_TO_CONFIRM_MOUNTING_M,
             is_target_stationary=True,
         )
     spread_m = math.sqrt(sum(abs(q) ** 2 for _, q in pairs) / n)
     unexplained_m = math.sqrt(sum(abs(q - along * p) ** 2 for p, q in pairs) / n)
     turn = 1.0 - along
     if (
-        abs(along) >= MIN_MOVING_RATIO
+        abs(along) >= MIN_TARGET_TO_UP_AXIS_MOTION_RATIO_IF_MOVING
         and abs(turn) >= MIN_FITTED_ROTATION_MODULUS
         and abs(cmath.phase(turn)) >= MIN_DETECTED_CAMERA_YAW_ERROR_RAD
         and spread_m >= MIN_MOVING_TARGET_POSITION_RMS_M

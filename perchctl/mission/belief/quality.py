@@ -13,11 +13,11 @@ from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V
 MAX_LATERAL_SPEED_FROM_DRAUGHT_MPS = 0.5
 """Lateral speed that no draught can cause, m/s. Larger: an impact during the press is noticed
 late."""
-MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS = 0.15
+MAX_RECENT_ESTIMATE_MINUS_IMU_VELOCITY_MPS = 0.15
 """Largest lateral velocity that the estimate may gain without the accelerometer, m/s; correct
 positions cause at most 0.07. Larger: positions in the wrong axes displace the vehicle further
 before they are noticed."""
-MIN_TARGET_DISTANCE_BELOW_VEHICLE_M = 0.3
+MIN_DISTANCE_TO_COUNT_TARGET_AS_BELOW_M = 0.3
 """Distance of the target below the vehicle beyond which it cannot be on the ceiling, m."""
 NO_ESTIMATE_CORRECTION_TEXT = (
     "the estimate's variance keeps growing; the positioning system may have failed"
@@ -26,14 +26,14 @@ NO_ESTIMATE_CORRECTION_TEXT = (
 
 def _does_estimate_contradict_imu(b: Belief) -> bool:
     """True if, with motion capture, the state estimate has recently gained more than
-    `MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS` of lateral velocity that the accelerometer has not
+    `MAX_RECENT_ESTIMATE_MINUS_IMU_VELOCITY_MPS` of lateral velocity that the accelerometer has not
     measured: the positions are then in the wrong axes. Always False with another position
     source."""
     by_capture = b.profile.positioning.source.is_mocap
     return (
         by_capture
-        and math.hypot(*b.dead_reckoning.lateral_velocity_missed_by_imu_mps)
-        > MAX_LATERAL_VELOCITY_MISSED_BY_IMU_MPS
+        and math.hypot(*b.dead_reckoning.recent_estimate_minus_imu_velocity_world_xy_mps)
+        > MAX_RECENT_ESTIMATE_MINUS_IMU_VELOCITY_MPS
     )
 
 
@@ -66,7 +66,7 @@ ESTIMATE_VARIANCE_TOO_LARGE = Condition[Belief](
 TARGET_BELOW_VEHICLE = Condition[Belief](
     "target below",
     lambda b: (
-        b.target.is_fresh and b.target.gear_to_target_z_m < -MIN_TARGET_DISTANCE_BELOW_VEHICLE_M
+        b.target.is_fresh and b.target.gear_to_target_z_m < -MIN_DISTANCE_TO_COUNT_TARGET_AS_BELOW_M
     ),
 )
 """The target appears below the vehicle, so the mounting must be wrong."""

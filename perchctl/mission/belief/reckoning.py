@@ -3,9 +3,9 @@
 While positions correct the state estimate, the reckoned velocity v is pulled towards the estimated
 velocity e, and the bias b (the error of accelerometer and attitude) is learned from the difference:
 
-    v += (dv_imu - b dt)                                            each sample
-    v += (e - v) dt / DEAD_RECKONED_VELOCITY_TIME_CONSTANT_S        while e is trusted
-    b += (dv_imu - de - b dt) / ACCELERATION_BIAS_TIME_CONSTANT_S   while e is trusted
+    v += (dv_imu - b dt)                                               each sample
+    v += (e - v) dt / VELOCITY_CORRECTION_BY_ESTIMATE_TIME_CONSTANT_S  while e is trusted
+    b += (dv_imu - de - b dt) / ACCELERATION_BIAS_TIME_CONSTANT_S      while e is trusted
 
 Without positions, only the first line applies. The gear's offset from the target is integrated with
 v from the last sighting; its standard deviation grows with the time since then and with the
@@ -32,7 +32,7 @@ from perchctl.mission.belief.motion import (
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
-DEAD_RECKONED_VELOCITY_TIME_CONSTANT_S = 3.0
+VELOCITY_CORRECTION_BY_ESTIMATE_TIME_CONSTANT_S = 3.0
 """Time constant with which the reckoned velocity approaches a trusted estimate, s. Larger: an old
 error of the reckoned velocity persists. Smaller: a wrong estimate is followed."""
 ACCELERATION_BIAS_TIME_CONSTANT_S = 4.0
@@ -53,12 +53,12 @@ MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS = 1.0
 MAGNET_REACH_BELOW_TARGET_M = 0.04
 """Distance below the target at which the magnet may have caught the gear, m. Larger: a flying
 vehicle is treated as one that may hang. Smaller: a caught vehicle is treated as flying."""
-MAX_BOUNCE_DISTANCE_BELOW_TARGET_M = 0.1
+MAX_GEAR_BELOW_TARGET_IF_BOUNCING_M = 0.1
 """Distance below the target within which the reckoned vertical speed follows the estimate, m: a
 bounce off the ceiling happens between two telemetry samples, but the firmware integrates it at 1
 kHz. Larger: errors of the estimate due to late pictures are adopted. Smaller: after a bounce, the
 reckoned speed is wrong by up to 0.3 m/s."""
-VELOCITY_MISSED_BY_ESTIMATE_TIME_CONSTANT_S = 1.0
+IMU_MINUS_ESTIMATE_VELOCITY_FORGETTING_TIME_CONSTANT_S = 1.0
 """Time constant with which positions correct a velocity that the estimate has missed, s. Larger: a
 velocity that a wrong attitude accumulates over seconds looks like an impact. Smaller: an impact
 just before the last sighting is forgotten."""
@@ -69,7 +69,7 @@ ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S = 2.0
 """Time constant with which the bias of the estimated velocity is learned, s. Larger: after a change
 in the wind, the vehicle seems to move for longer. Smaller: noise of the position is learned as a
 bias."""
-VELOCITY_MISSED_BY_IMU_TIME_CONSTANT_S = 0.5
+ESTIMATE_MINUS_IMU_VELOCITY_FORGETTING_TIME_CONSTANT_S = 0.5
 """Time constant with which a velocity gained by the estimate alone is forgotten, s."""
 MIN_UNEXPLAINED_POSITION_STEP_M = 0.005
 """Smallest motion of the estimated position, beyond what its velocity explains, that counts as a
@@ -90,9 +90,9 @@ of a contact is reported as more precise than it is."""
 POSITION_SIGMA_TO_DISTANCE_FLOWN_RATIO = 0.3
 """Fraction of the distance flown without a sighting that is added to the standard deviation of a
 dead-reckoned position."""
-VELOCITY_MISSED_BY_IMU_TO_BIAS_GAIN_PER_S = 1.5
+BIAS_CORRECTION_PER_ESTIMATE_MINUS_IMU_VELOCITY_PER_S = 1.5
 """Bias of the acceleration, m/s^2, that positions in the wrong axes cause per m/s of
-`lateral_velocity_missed_by_imu_mps`."""
+`recent_estimate_minus_imu_velocity_world_xy_mps`."""
 MAX_HEIGHT_INTEGRATION_STEP_S = 0.5
 """Longest integration step of the dead-reckoned height, s; a longer step is a gap."""
 
@@ -105,16 +105,16 @@ class DeadReckoning:
     learned before. While the vector is unknown, its standard deviation is infinite. While the
     distance is unknown, it is infinite itself."""
 
-    imu: ImuMotion | None = None  # IMU motion up to which this value is integrated
-    velocity_mps: Vector = ZERO_VECTOR
+    imu_at_last_update: ImuMotion | None = None  # IMU motion up to which this value is integrated
+    velocity_world_mps: Vector = ZERO_VECTOR
     acceleration_bias_world_mps2: Vector = ZERO_VECTOR  # error of accelerometer and attitude
     # mean lateral reading of the accelerometer
     mean_specific_force_world_xy_mps2: tuple[float, float] = (0.0, 0.0)
-    estimated_velocity_mps: Vector = ZERO_VECTOR
+    estimated_velocity_world_mps: Vector = ZERO_VECTOR
     # lateral velocity gained recently by the state estimate alone
-    lateral_velocity_missed_by_imu_mps: tuple[float, float] = (0.0, 0.0)
+    recent_estimate_minus_imu_velocity_world_xy_mps: tuple[float, float] = (0.0, 0.0)
     # lateral velocity gained recently by the accelerometer alone
-    lateral_velocity_missed_by_estimate_mps: tuple[float, float] = (0.0, 0.0)
+    recent_imu_minus_estimate_velocity_world_xy_mps: tuple[float, float] = (0.0, 0.0)
     # distance of the gear below the target; inf if it is unseen or the vehicle has fallen
     gear_below_target_m: float = math.inf
     # lower bound of `gear_below_target_m`: it allows for climbs in telemetry gaps, and falls only
@@ -129,7 +129,7 @@ class DeadReckoning:
     # exposure time of the sighting from which the offset is integrated
     last_sighting_at_s: float = -math.inf
     # sum of the steps of the estimated position since that sighting
-    unexplained_position_step_sum_xy_m: tuple[float, float] = (0.0, 0.0)
+    unexplained_position_step_sum_world_xy_m: tuple[float, float] = (0.0, 0.0)
     last_unexplained_position_step_at_s: float = -math.inf  # time of the newest step
     climb_before_impact_mps: float = 0.0  # vertical speed just before `ImuMotion.newest_impact`
     # lateral bias of the estimated velocity
@@ -165,13 +165,13 @@ def advance_dead_reckoning(
     - `is_position_diverged`: the estimated velocity may be in the wrong axes, so keep the reckoned
       velocity, even after a gap in the telemetry.
     """
-    estimated_velocity_mps, impact = sample.velocity_mps, imu.newest_impact
-    if old.imu is not None and impact.t_s > old.imu.newest_impact.t_s:
-        carried = not old.imu.t_s < imu.last_telemetry_gap_ended_at_s <= impact.t_s
+    estimated_velocity_world_mps, impact = sample.velocity_mps, imu.newest_impact
+    if old.imu_at_last_update is not None and impact.t_s > old.imu_at_last_update.newest_impact.t_s:
+        carried = not old.imu_at_last_update.t_s < imu.last_telemetry_gap_ended_at_s <= impact.t_s
         carried_mps = (
-            old.velocity_mps[2]
+            old.velocity_world_mps[2]
             + impact.imu_climb_before_impact_mps
-            - old.imu.velocity_since_first_sample_world_mps[2]
+            - old.imu_at_last_update.velocity_since_first_sample_world_mps[2]
         )
         old = replace(
             old,
@@ -180,17 +180,21 @@ def advance_dead_reckoning(
             else impact.estimated_climb_before_impact_mps,
         )
     frozen = imu.attitude_frozen_for_s > MAX_FROZEN_READING_DURATION_S
-    if old.imu is None or imu.last_telemetry_gap_ended_at_s > old.imu.t_s or frozen:
-        return _restart(
+    if (
+        old.imu_at_last_update is None
+        or imu.last_telemetry_gap_ended_at_s > old.imu_at_last_update.t_s
+        or frozen
+    ):
+        return _restart_dead_reckoning(
             old,
             imu,
-            estimated_velocity_mps,
+            estimated_velocity_world_mps,
             is_estimate_trusted=is_estimate_trusted,
             is_position_diverged=is_position_diverged,
         )
     return _integrate_sample(
         old,
-        old.imu,
+        old.imu_at_last_update,
         imu,
         sample,
         is_estimate_trusted=is_estimate_trusted,
@@ -199,10 +203,10 @@ def advance_dead_reckoning(
     )
 
 
-def _restart(
+def _restart_dead_reckoning(
     old: DeadReckoning,
     imu: ImuMotion,
-    estimated_velocity_mps: Vector,
+    estimated_velocity_world_mps: Vector,
     *,
     is_estimate_trusted: bool,
     is_position_diverged: bool,
@@ -210,49 +214,58 @@ def _restart(
     """Return the dead reckoning at the first sample, after a gap in the telemetry, or while the
     attitude is frozen, when `imu` cannot be integrated.
 
-    If the state estimate is trusted, the velocity becomes `estimated_velocity_mps` (world axes).
-    Otherwise, it changes by as much as the estimated velocity has changed since `old`. With
+    If the state estimate is trusted, the velocity becomes `estimated_velocity_world_mps` (world
+    axes). Otherwise, it changes by as much as the estimated velocity has changed since `old`. With
     diverged positions, the velocity of `old` is kept, apart from the vertical speed that `imu` has
     gained. The horizontal vector from the gear to the target becomes unknown. After a gap in the
     telemetry, the lower bound of the gear's distance below the target allows for the highest climb
     that is possible during the gap.
     """
-    velocity_mps = estimated_velocity_mps if is_estimate_trusted else ZERO_VECTOR
+    velocity_world_mps = estimated_velocity_world_mps if is_estimate_trusted else ZERO_VECTOR
     if is_position_diverged:
-        vx, vy, vz = old.velocity_mps
-        if old.imu is not None and imu.last_telemetry_gap_ended_at_s <= old.imu.t_s:
+        vx, vy, vz = old.velocity_world_mps
+        if (
+            old.imu_at_last_update is not None
+            and imu.last_telemetry_gap_ended_at_s <= old.imu_at_last_update.t_s
+        ):
             vz += (
                 imu.velocity_since_first_sample_world_mps[2]
-                - old.imu.velocity_since_first_sample_world_mps[2]
+                - old.imu_at_last_update.velocity_since_first_sample_world_mps[2]
             )
-        velocity_mps = (vx, vy, vz)
-    elif not is_estimate_trusted and old.imu is not None:
+        velocity_world_mps = (vx, vy, vz)
+    elif not is_estimate_trusted and old.imu_at_last_update is not None:
         vx, vy, vz = (
             v + e - o
             for v, e, o in zip(
-                old.velocity_mps, estimated_velocity_mps, old.estimated_velocity_mps, strict=True
+                old.velocity_world_mps,
+                estimated_velocity_world_mps,
+                old.estimated_velocity_world_mps,
+                strict=True,
             )
         )
-        velocity_mps = (vx, vy, vz)
+        velocity_world_mps = (vx, vy, vz)
     unknown = replace(
         old,
-        imu=imu,
-        velocity_mps=velocity_mps,
-        estimated_velocity_mps=estimated_velocity_mps,
-        lateral_velocity_missed_by_imu_mps=(0.0, 0.0),
-        lateral_velocity_missed_by_estimate_mps=(0.0, 0.0),
+        imu_at_last_update=imu,
+        velocity_world_mps=velocity_world_mps,
+        estimated_velocity_world_mps=estimated_velocity_world_mps,
+        recent_estimate_minus_imu_velocity_world_xy_mps=(0.0, 0.0),
+        recent_imu_minus_estimate_velocity_world_xy_mps=(0.0, 0.0),
     )
-    if old.imu is None:
+    if old.imu_at_last_update is None:
         return unknown
-    if imu.last_telemetry_gap_ended_at_s > old.imu.t_s:
+    if imu.last_telemetry_gap_ended_at_s > old.imu_at_last_update.t_s:
         # A vehicle whose motors were off before and after the gap, or that has restarted, cannot
         # have climbed under power.
-        off = old.imu.motors_stopped_at_s <= old.imu.t_s and imu.motors_stopped_at_s <= imu.t_s
-        flew = not (off or imu.vehicle_restarted_at_s > old.imu.t_s)
-        climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS
+        off = (
+            old.imu_at_last_update.motors_stopped_at_s <= old.imu_at_last_update.t_s
+            and imu.motors_stopped_at_s <= imu.t_s
+        )
+        flew = not (off or imu.vehicle_restarted_at_s > old.imu_at_last_update.t_s)
+        climb_mps = max(0.0, old.velocity_world_mps[2]) + CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS
         climb_m = climb_mps**2 / (2.0 * GRAVITY_MPS2)
         if flew:
-            climb_m = MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS * (imu.t_s - old.imu.t_s)
+            climb_m = MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS * (imu.t_s - old.imu_at_last_update.t_s)
         gear_below_target_lower_bound_m = old.gear_below_target_lower_bound_m - climb_m
         near = gear_below_target_lower_bound_m < MAGNET_REACH_BELOW_TARGET_M
         unknown = replace(
@@ -287,16 +300,21 @@ def _integrate_sample(
     `is_estimated_velocity_being_corrected`: positions correct the estimated velocity, so a lateral
     velocity that only the accelerometer has measured is forgotten gradually.
     """
-    estimated_velocity_mps, dt_s = sample.velocity_mps, imu.t_s - previous_imu.t_s
+    estimated_velocity_world_mps, dt_s = sample.velocity_mps, imu.t_s - previous_imu.t_s
     if not dt_s > 0.0:
         return old
-    velocity, bias, lateral_velocity_missed_by_imu_mps, missed = [], [], [0.0, 0.0], [0.0, 0.0]
+    velocity, bias, recent_estimate_minus_imu_velocity_world_xy_mps, missed = (
+        [],
+        [],
+        [0.0, 0.0],
+        [0.0, 0.0],
+    )
     remembers = (
-        math.exp(-dt_s / VELOCITY_MISSED_BY_ESTIMATE_TIME_CONSTANT_S)
+        math.exp(-dt_s / IMU_MINUS_ESTIMATE_VELOCITY_FORGETTING_TIME_CONSTANT_S)
         if is_estimated_velocity_being_corrected
         else 1.0
     )
-    keeps = math.exp(-dt_s / VELOCITY_MISSED_BY_IMU_TIME_CONSTANT_S)
+    keeps = math.exp(-dt_s / ESTIMATE_MINUS_IMU_VELOCITY_FORGETTING_TIME_CONSTANT_S)
     calm = (
         is_estimate_trusted
         and imu.t_s - imu.last_lateral_push_at_s > MAX_PUSH_TO_ESTIMATE_RESPONSE_DELAY_S
@@ -316,29 +334,40 @@ def _integrate_sample(
         if (
             i == 2
             and is_estimate_trusted
-            and old.gear_below_target_m < MAX_BOUNCE_DISTANCE_BELOW_TARGET_M
+            and old.gear_below_target_m < MAX_GEAR_BELOW_TARGET_IF_BOUNCING_M
         ):
             gained = (
-                estimated_velocity_mps[2]
-                - old.estimated_velocity_mps[2]
+                estimated_velocity_world_mps[2]
+                - old.estimated_velocity_world_mps[2]
                 + old.acceleration_bias_world_mps2[2] * dt_s
             )
         v, b = (
-            old.velocity_mps[i] + gained - old.acceleration_bias_world_mps2[i] * dt_s,
+            old.velocity_world_mps[i] + gained - old.acceleration_bias_world_mps2[i] * dt_s,
             old.acceleration_bias_world_mps2[i],
         )
         if i < 2:
-            alone = gained - b * dt_s - (estimated_velocity_mps[i] - old.estimated_velocity_mps[i])
-            missed[i] = remembers * old.lateral_velocity_missed_by_estimate_mps[i] + alone
-        if is_estimate_trusted and (i == 2 or not ignores_lateral_estimate):
-            v += (estimated_velocity_mps[i] - v) * min(
-                1.0, dt_s / DEAD_RECKONED_VELOCITY_TIME_CONSTANT_S
+            alone = (
+                gained
+                - b * dt_s
+                - (estimated_velocity_world_mps[i] - old.estimated_velocity_world_mps[i])
             )
-            wrong = (gained - (estimated_velocity_mps[i] - old.estimated_velocity_mps[i])) / dt_s
+            missed[i] = remembers * old.recent_imu_minus_estimate_velocity_world_xy_mps[i] + alone
+        if is_estimate_trusted and (i == 2 or not ignores_lateral_estimate):
+            v += (estimated_velocity_world_mps[i] - v) * min(
+                1.0, dt_s / VELOCITY_CORRECTION_BY_ESTIMATE_TIME_CONSTANT_S
+            )
+            wrong = (
+                gained - (estimated_velocity_world_mps[i] - old.estimated_velocity_world_mps[i])
+            ) / dt_s
             if calm and i < 2:
-                more = estimated_velocity_mps[i] - old.estimated_velocity_mps[i] - gained + b * dt_s
-                lateral_velocity_missed_by_imu_mps[i] = (
-                    keeps * old.lateral_velocity_missed_by_imu_mps[i] + more
+                more = (
+                    estimated_velocity_world_mps[i]
+                    - old.estimated_velocity_world_mps[i]
+                    - gained
+                    + b * dt_s
+                )
+                recent_estimate_minus_imu_velocity_world_xy_mps[i] = (
+                    keeps * old.recent_estimate_minus_imu_velocity_world_xy_mps[i] + more
                 )
             if abs(wrong) <= MAX_ACCELERATION_BIAS_INNOVATION_MPS2:
                 share = min(1.0, dt_s / ACCELERATION_BIAS_TIME_CONSTANT_S)
@@ -362,19 +391,19 @@ def _integrate_sample(
     ex, ey = old.gear_to_target_world_xy_m
     return replace(
         old,
-        imu=imu,
-        velocity_mps=(vx, vy, vz),
+        imu_at_last_update=imu,
+        velocity_world_mps=(vx, vy, vz),
         acceleration_bias_world_mps2=(bias[0], bias[1], bias[2]),
         mean_specific_force_world_xy_mps2=(
             mean_specific_force_world_xy_mps2[0],
             mean_specific_force_world_xy_mps2[1],
         ),
-        estimated_velocity_mps=estimated_velocity_mps,
-        lateral_velocity_missed_by_imu_mps=(
-            lateral_velocity_missed_by_imu_mps[0],
-            lateral_velocity_missed_by_imu_mps[1],
+        estimated_velocity_world_mps=estimated_velocity_world_mps,
+        recent_estimate_minus_imu_velocity_world_xy_mps=(
+            recent_estimate_minus_imu_velocity_world_xy_mps[0],
+            recent_estimate_minus_imu_velocity_world_xy_mps[1],
         ),
-        lateral_velocity_missed_by_estimate_mps=(missed[0], missed[1]),
+        recent_imu_minus_estimate_velocity_world_xy_mps=(missed[0], missed[1]),
         gear_below_target_m=math.inf
         if fell
         else old.gear_below_target_m - (vz + CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS) * dt_s,
@@ -385,22 +414,22 @@ def _integrate_sample(
 
 
 def learn_estimated_velocity_bias(
-    old: DeadReckoning, last: Telemetry, new: Telemetry
+    old: DeadReckoning, previous_sample: Telemetry, sample: Telemetry
 ) -> DeadReckoning:
     """Return the dead reckoning with the lateral bias of the estimated velocity (world x and y)
-    learned from `last` and `new`, the newest samples of two successive ticks, during a flight in
-    free air under position control.
+    learned from `previous_sample` and `sample`, the newest samples of two successive ticks, during
+    a flight in free air under position control.
 
     In a steady wind, the firmware mistakes the drag for a tilt, and the estimated velocity is wrong
     by up to 0.4 m/s while the vehicle hovers in place. The bias is the estimated velocity minus the
     velocity of the estimated position, both passed through the same low-pass filter. The learned
     bias is wrong for about `ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S` after a change in the wind.
     """
-    dt_s = new.t_s - last.t_s
+    dt_s = sample.t_s - previous_sample.t_s
     if not 0.0 < dt_s <= MAX_TELEMETRY_GAP_S:
         return restart_velocity_bias_filters(old)
     share = 1.0 - math.exp(-dt_s / ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S)
-    before_m = old.mean_estimated_position_world_xy_m or new.position_m[:2]
+    before_m = old.mean_estimated_position_world_xy_m or sample.position_m[:2]
     before_mps = (
         old.estimated_velocity_bias_world_xy_mps
         if old.mean_estimated_position_world_xy_m is None
@@ -408,11 +437,11 @@ def learn_estimated_velocity_bias(
     )
     velocity, position, bias = [], [], []
     for i in range(2):
-        velocity.append(before_mps[i] + share * (new.velocity_mps[i] - before_mps[i]))
-        position.append(before_m[i] + share * (new.position_m[i] - before_m[i]))
+        velocity.append(before_mps[i] + share * (sample.velocity_mps[i] - before_mps[i]))
+        position.append(before_m[i] + share * (sample.position_m[i] - before_m[i]))
         bias.append(
             velocity[i]
-            - (new.position_m[i] - position[i]) / ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S
+            - (sample.position_m[i] - position[i]) / ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S
         )
     size_mps = math.hypot(*bias)
     part = (
@@ -472,37 +501,37 @@ def correct_acceleration_bias_for_wrong_positions(old: DeadReckoning) -> DeadRec
     """Return the dead reckoning with its lateral acceleration bias corrected after positions in the
     wrong axes. Such positions have given the state estimate a velocity that the accelerometer has
     not measured and, in proportion to it, a wrong tilt, which was learned as a bias. The correction
-    is this velocity times `VELOCITY_MISSED_BY_IMU_TO_BIAS_GAIN_PER_S`."""
+    is this velocity times `BIAS_CORRECTION_PER_ESTIMATE_MINUS_IMU_VELOCITY_PER_S`."""
     (bx, by, bz), (x_mps, y_mps) = (
         old.acceleration_bias_world_mps2,
-        old.lateral_velocity_missed_by_imu_mps,
+        old.recent_estimate_minus_imu_velocity_world_xy_mps,
     )
     return replace(
         old,
         acceleration_bias_world_mps2=(
-            bx + VELOCITY_MISSED_BY_IMU_TO_BIAS_GAIN_PER_S * x_mps,
-            by + VELOCITY_MISSED_BY_IMU_TO_BIAS_GAIN_PER_S * y_mps,
+            bx + BIAS_CORRECTION_PER_ESTIMATE_MINUS_IMU_VELOCITY_PER_S * x_mps,
+            by + BIAS_CORRECTION_PER_ESTIMATE_MINUS_IMU_VELOCITY_PER_S * y_mps,
             bz,
         ),
     )
 
 
 def accumulate_unexplained_position_step(
-    old: DeadReckoning, last: Telemetry, sample: Telemetry
+    old: DeadReckoning, previous_sample: Telemetry, sample: Telemetry
 ) -> DeadReckoning:
     """Return the dead reckoning with one more lateral step of the estimated position added to their
-    sum, which makes the offset at a contact less certain. A step is the motion from `last` to
-    `sample` beyond what the estimated velocity explains. Steps below a threshold that grows with
-    the time between the samples are ignored. If more than
+    sum, which makes the offset at a contact less certain. A step is the motion from
+    `previous_sample` to `sample` beyond what the estimated velocity explains. Steps below a
+    threshold that grows with the time between the samples are ignored. If more than
     `MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S` lies between the samples, no step is added, because
     the step may be the vehicle's motion."""
-    dt_s = _position_timestamp_s(sample) - _position_timestamp_s(last)
+    dt_s = _position_timestamp_s(sample) - _position_timestamp_s(previous_sample)
     if not 0.0 < dt_s <= MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S:
         return old
     x_m, y_m = (
         sample.position_m[i]
-        - last.position_m[i]
-        - 0.5 * (last.velocity_mps[i] + sample.velocity_mps[i]) * dt_s
+        - previous_sample.position_m[i]
+        - 0.5 * (previous_sample.velocity_mps[i] + sample.velocity_mps[i]) * dt_s
         for i in range(2)
     )
     if (
@@ -510,10 +539,10 @@ def accumulate_unexplained_position_step(
         <= MIN_UNEXPLAINED_POSITION_STEP_M + UNEXPLAINED_POSITION_STEP_THRESHOLD_GROWTH_MPS * dt_s
     ):
         return old
-    sx_m, sy_m = old.unexplained_position_step_sum_xy_m
+    sx_m, sy_m = old.unexplained_position_step_sum_world_xy_m
     return replace(
         old,
-        unexplained_position_step_sum_xy_m=(sx_m + x_m, sy_m + y_m),
+        unexplained_position_step_sum_world_xy_m=(sx_m + x_m, sy_m + y_m),
         last_unexplained_position_step_at_s=sample.t_s,
     )
 

@@ -65,7 +65,7 @@ class TargetBelief:
     is_small_marker_fresh: bool = False
 
     @property
-    def is_far_above(self) -> bool:
+    def is_too_far_above_to_hold_vehicle(self) -> bool:
         """True if the target's world position is known and the target is more than
         `MIN_GEAR_TO_TARGET_Z_TO_EXCLUDE_HANGING_M` above the gear, so that its magnet cannot be
         holding the vehicle."""

@@ -84,7 +84,7 @@ MEAN_THRUST_DIRECTION_TIME_CONSTANT_S = 0.5
 """Time constant of the mean tilt, s. Larger: a gust, or a changing error of the estimated attitude,
 moves the vehicle off the target's axis. Smaller: feedback of the tilt no longer damps the
 motion."""
-TARGET_SCATTER_FRACTION_KEPT_PER_FRAME = 0.9
+TARGET_SCATTER_DECAY_FACTOR_PER_FRAME = 0.9
 """Fraction of the target's scatter that remains after each frame."""
 
 
@@ -109,11 +109,11 @@ def update_belief(
     b = replace(b, lateral_offset_filter=b.lateral_offset_filter.with_sample(sample))
     b = _update_target(b)
     if has_tick_gap(belief, obs, profile):
-        b = _reset_after_tick_gap(b)
+        b = _reset_conditions_after_tick_gap(b)
     if b.is_position_stale:
         b = replace(b, position_last_stale_at_s=obs.t_s)
     if obs.has_estimated_position_jumped:
-        b = _shift_remembered_positions(b)
+        b = _shift_stored_positions_after_frame_jump(b)
     if obs.heading_jump_rad > math.radians(profile.safety.heading_lost_deg):
         b = replace(b, is_heading_lost=True, hover_thrust_estimate=hover.estimate_hover_thrust(b))
     b = _compare_thrust_with_command(b)
@@ -152,7 +152,7 @@ def reset_phase_dependent_conditions(b: Belief) -> Belief:
     )
 
 
-def update_after_command(b: Belief, command: Command) -> Belief:
+def update_thrust_check_after_command(b: Belief, command: Command) -> Belief:
     """Return the belief after a command was sent. Any command other than raw thrust or idle ends
     the check that the reported thrust follows the commanded raw thrust."""
     if isinstance(command, (RawThrust, Idle)):
@@ -183,13 +183,11 @@ def _update_target(b: Belief) -> Belief:
     spread_m = 0.0
     if b.last_target_world_m is not None:
         moved_m = float(np.linalg.norm(target.world_m - b.last_target_world_m))
-        spread_m = max(
-            moved_m, TARGET_SCATTER_FRACTION_KEPT_PER_FRAME * b.target_position_scatter_m
-        )
+        spread_m = max(moved_m, TARGET_SCATTER_DECAY_FACTOR_PER_FRAME * b.target_position_scatter_m)
     return replace(b, last_target_world_m=target.world_m, target_position_scatter_m=spread_m)
 
 
-def _reset_after_tick_gap(b: Belief) -> Belief:
+def _reset_conditions_after_tick_gap(b: Belief) -> Belief:
     """Return the belief after a gap in which the planner did not run: the times since when
     conditions have been true are forgotten, except for conditions that persist across phases.
     Motors that are off as commanded count as off since the end of the last gap in the telemetry, or
@@ -213,7 +211,7 @@ def _reset_after_tick_gap(b: Belief) -> Belief:
     )
 
 
-def _shift_remembered_positions(b: Belief) -> Belief:
+def _shift_stored_positions_after_frame_jump(b: Belief) -> Belief:
     """Return the belief after a jump of the estimated position, which has moved the estimate's
     world frame but not the vehicle. The stored positions (take-off, contact, start of the maneuver,
     setpoint) move with the frame, so that they stay in place relative to the vehicle. They stay
@@ -265,7 +263,7 @@ def _compare_thrust_with_command(b: Belief) -> Belief:
     """Return the belief with the loop time at which the reported thrust began to differ from the
     commanded raw thrust by more than `MAX_THRUST_DEVIATION_FROM_COMMAND_FRACTION`; None while they
     agree."""
-    order = b.command_history.raw_thrust
+    order = b.command_history.commanded_raw_thrust
     if order is None:
         return b
     wanted = 0.0 if order < KEEPALIVE_RAW_THRUST else min(MAX_RAW_THRUST, order)
@@ -369,12 +367,12 @@ def _zero_reckoned_velocity_at_contact(b: Belief, new: DeadReckoning) -> DeadRec
     is_laterally_unsteady = (
         obs.t_s - obs.imu.lateral_velocity_became_steady_at_s < STILL_AT_CONTACT_DWELL_S
     )
-    x_mps, y_mps, _ = new.velocity_mps
+    x_mps, y_mps, _ = new.velocity_world_mps
     new = replace(
-        new, velocity_mps=(x_mps, y_mps, 0.0) if is_laterally_unsteady else (0.0, 0.0, 0.0)
+        new, velocity_world_mps=(x_mps, y_mps, 0.0) if is_laterally_unsteady else (0.0, 0.0, 0.0)
     )
     if not is_laterally_unsteady:
-        new = learn_acceleration_bias_at_rest(new, b.dead_reckoning.imu, obs.imu)
+        new = learn_acceleration_bias_at_rest(new, b.dead_reckoning.imu_at_last_update, obs.imu)
     if obs.telemetry.thrust < 1:  # a hanging vehicle stays in place
         old = b.dead_reckoning
         new = replace(
@@ -396,15 +394,15 @@ def _adopt_visual_inertial_velocity(b: Belief, new: DeadReckoning) -> DeadReckon
     still arrive but the estimated velocity does not. The accelerometer alone is off by a quarter of
     a metre per second within three seconds.
     """
-    motion, before = b.obs.visual_inertial_motion, b.dead_reckoning.imu
+    motion, before = b.obs.visual_inertial_motion, b.dead_reckoning.imu_at_last_update
     if motion is None or not (before is None or motion.t_s > before.t_s):
         return new
     is_estimate_late = b.camera_imu_mismatch.camera_latency_error_s != 0.0
     climb_mps = motion.climb_mps if is_estimate_late or not b.is_telemetry_fresh else None
-    climb_mps = new.velocity_mps[2] if climb_mps is None else climb_mps
+    climb_mps = new.velocity_world_mps[2] if climb_mps is None else climb_mps
     return replace(
         new,
-        velocity_mps=(*motion.velocity_world_xy_mps, climb_mps),
+        velocity_world_mps=(*motion.velocity_world_xy_mps, climb_mps),
         acceleration_bias_world_mps2=(
             *motion.acceleration_bias_world_xy_mps2,
             new.acceleration_bias_world_mps2[2],
@@ -440,7 +438,7 @@ def _restart_at_sighting(b: Belief, new: DeadReckoning) -> DeadReckoning:
         new, target.last_measured_at_s, gear_to_target_world_xy_m, float(ez), sigma_m
     )
     if seen and target.last_measured_at_s > new.last_unexplained_position_step_at_s:
-        new = replace(new, unexplained_position_step_sum_xy_m=(0.0, 0.0))
+        new = replace(new, unexplained_position_step_sum_world_xy_m=(0.0, 0.0))
     return new
 
 
@@ -464,7 +462,7 @@ def _correct_height_of_supported_vehicle(b: Belief, new: DeadReckoning) -> DeadR
         new,
         gear_below_target_m=min(0.0, new.gear_below_target_m),
         gear_below_target_lower_bound_m=min(0.0, new.gear_below_target_lower_bound_m),
-        velocity_mps=(*new.velocity_mps[:2], 0.0),
+        velocity_world_mps=(*new.velocity_world_mps[:2], 0.0),
     )
 
 
@@ -501,7 +499,7 @@ def _climb_since_last_tick_m(b: Belief, new: DeadReckoning) -> float:
     """Return how far a vehicle without a position has climbed since the previous tick, m, positive
     up: the climb rate of the dead reckoning `new` times the time or, after a gap in the telemetry,
     the change of the estimated height. 0 for a vehicle with a position."""
-    obs, before, last = b.obs, b.dead_reckoning.imu, b.last_telemetry
+    obs, before, last = b.obs, b.dead_reckoning.imu_at_last_update, b.last_telemetry
     if b.dead_reckoning_began_at_s is None or before is None:
         return 0.0
     dt_s = max(0.0, min(MAX_HEIGHT_INTEGRATION_STEP_S, obs.imu.t_s - before.t_s))
@@ -513,7 +511,7 @@ def _climb_since_last_tick_m(b: Belief, new: DeadReckoning) -> float:
     )
     if heard_again and last is not None and tel.start == last.start:
         return tel.position_m[2] - last.position_m[2]
-    return new.velocity_mps[2] * dt_s
+    return new.velocity_world_mps[2] * dt_s
 
 
 # --- Evidence and learning ---

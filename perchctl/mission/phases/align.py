@@ -17,7 +17,7 @@ from perchctl.mission.phase import Phase, Severity
 from perchctl.mission.phases.ascend import HOVER_HEIGHT_TOLERANCE_M
 from perchctl.mission.phases.recover import has_recovered
 from perchctl.mission.setpoints import (
-    MIN_HELD_SETPOINT_HEIGHT_M,
+    MIN_HELD_SETPOINT_HEIGHT_ABOVE_GROUND_M,
     Action,
     fly_under_target,
     make_setpoint_at_vehicle,
@@ -56,7 +56,7 @@ def is_aligned(c: Context) -> bool:
     return c.true_for_s(ALIGNED) >= c.planner.align.dwell_s
 
 
-def is_charge_too_low_for_attempt(c: Context) -> bool:
+def is_charge_too_low_to_begin_attempt(c: Context) -> bool:
     """True if the vehicle is about to begin an attempt (it is aligned in ALIGN, or has recovered in
     RECOVER), attempts are left, and the battery has too little charge for one. Always False before
     that moment, whatever the charge."""
@@ -68,7 +68,7 @@ def is_charge_too_low_for_attempt(c: Context) -> bool:
     )
 
 
-def planned_hover_height_m(c: Context) -> float | None:
+def planned_hover_height_above_ground_m(c: Context) -> float | None:
     """Return the height above the ground at which the vehicle would hover below the target, m; None
     if the mission does not hover."""
     hover, b = c.planner.hover, c.belief
@@ -81,26 +81,26 @@ def planned_hover_height_m(c: Context) -> float | None:
 
 def is_hover_height_unsafe(c: Context) -> bool:
     """True if the vehicle is aligned and would hover lower than
-    `MIN_HELD_SETPOINT_HEIGHT_M` above the ground, or higher than `safety.max_height_m`
+    `MIN_HELD_SETPOINT_HEIGHT_ABOVE_GROUND_M` above the ground, or higher than `safety.max_height_m`
     minus `HOVER_HEIGHT_TOLERANCE_M`. False if the mission does not hover."""
-    height_m = planned_hover_height_m(c)
+    height_m = planned_hover_height_above_ground_m(c)
     if height_m is None or not is_aligned(c):
         return False
     highest_m = c.safety.max_height_m - HOVER_HEIGHT_TOLERANCE_M
-    return not MIN_HELD_SETPOINT_HEIGHT_M <= height_m <= highest_m
+    return not MIN_HELD_SETPOINT_HEIGHT_ABOVE_GROUND_M <= height_m <= highest_m
 
 
-def unsafe_hover_reason(c: Context) -> str:
+def unsafe_hover_height_reason(c: Context) -> str:
     """Return a message with the height at which the vehicle would hover and the range of allowed
     heights, both above the ground. Only valid in a mission that hovers."""
-    hover, height_m = c.planner.hover, planned_hover_height_m(c)
+    hover, height_m = c.planner.hover, planned_hover_height_above_ground_m(c)
     assert hover is not None
     assert height_m is not None
     highest_m = c.safety.max_height_m - HOVER_HEIGHT_TOLERANCE_M
     return (
         f"{hover.below_m:g} m below the target is {height_m:.2f} m above the ground, but the "
-        f"vehicle hovers only {MIN_HELD_SETPOINT_HEIGHT_M:g} to {highest_m:g} m above the ground: "
-        f"change the distance below the target"
+        f"vehicle hovers only {MIN_HELD_SETPOINT_HEIGHT_ABOVE_GROUND_M:g} to {highest_m:g} m "
+        f"above the ground: change the distance below the target"
     )
 
 
@@ -110,7 +110,7 @@ ALIGN = PhaseDefinition(
         is_in_free_air=True, is_camera_guided=True, requires_pictures=True, learns_hover_thrust=True
     ),
     act=act_in_align,
-    conditions=(ALIGNED, CLIMB_WITHHELD),
+    timed_conditions=(ALIGNED, CLIMB_WITHHELD),
     exits=(
         Transition(
             "align-lost",
@@ -129,14 +129,14 @@ ALIGN = PhaseDefinition(
         land_row(
             "too-little-left",
             {Phase.ALIGN, Phase.RECOVER},
-            is_charge_too_low_for_attempt,
+            is_charge_too_low_to_begin_attempt,
             battery_shortfall_text,
         ),
         land_row(
             "hover-height",
             {Phase.ALIGN},
             is_hover_height_unsafe,
-            unsafe_hover_reason,
+            unsafe_hover_height_reason,
         ),
         land_row(
             "climb-not-permitted",

@@ -11,7 +11,7 @@ from perchctl.mission.setpoints import Action, fly_to, step_setpoint_towards
 from perchctl.mission.transition import Transition, land_row
 from perchctl.vehicle import PositionSetpoint
 
-MIN_HEIGHT_TO_CORRECT_HEIGHT_SETPOINT_M = 0.1
+MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M = 0.1
 """Height below which the vehicle may still be on the ground, m; the height is not corrected there.
 Larger: a heavy vehicle stays near the ground for longer. Smaller: a vehicle that is still on the
 ground jumps up."""
@@ -19,7 +19,7 @@ MIN_TAKEOFF_HEIGHT_FRACTION_FOR_LATERAL_APPROACH = 0.7
 """Fraction of the take-off height above which the vehicle flies to `planner.approach_xy_m`."""
 MIN_TAKEOFF_HEIGHT_FRACTION_TO_END_TAKEOFF = 0.8
 """Fraction of the take-off height that counts as reached."""
-MAX_TAKEOFF_END_SPEED_MPS = 0.25
+MAX_SPEED_TO_END_TAKEOFF_MPS = 0.25
 """Largest speed that counts as hovering, m/s."""
 TAKEOFF_END_DWELL_S = 0.3
 """Time for which the vehicle must hover to end the take-off, s."""
@@ -28,7 +28,7 @@ TAKEOFF_HEIGHT_REACHED = Condition[Context](
     "at take-off height",
     lambda c: (
         c.belief.height_m >= MIN_TAKEOFF_HEIGHT_FRACTION_TO_END_TAKEOFF * c.planner.takeoff_height_m
-        and c.belief.speed_mps <= MAX_TAKEOFF_END_SPEED_MPS
+        and c.belief.speed_mps <= MAX_SPEED_TO_END_TAKEOFF_MPS
         and c.state.setpoint is not None
     ),
 )
@@ -51,14 +51,14 @@ def act_in_approach(c: Context) -> Action:
         x, y = planner.approach_xy_m
     goal = PositionSetpoint(x, y, z + planner.takeoff_height_m, state.entry.yaw_rad)
     setpoint = step_setpoint_towards(c, start, goal, max_up_mps=planner.takeoff_speed_mps)
-    return fly_to(c, setpoint, corrects_height=b.height_m > MIN_HEIGHT_TO_CORRECT_HEIGHT_SETPOINT_M)
+    return fly_to(c, setpoint, corrects_height=b.height_m > MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M)
 
 
 APPROACH = PhaseDefinition(
     phase=Phase.APPROACH,
     maneuver=Maneuver(is_in_free_air=True),
     act=act_in_approach,
-    conditions=(TAKEOFF_HEIGHT_REACHED,),
+    timed_conditions=(TAKEOFF_HEIGHT_REACHED,),
     exits=(
         Transition(
             "approached",

@@ -41,7 +41,7 @@ positioning system holds the vehicle in place meanwhile. Larger: the vehicle wai
 has moved or is covered. Smaller: a burst of lost pictures ends an attempt that would succeed."""
 
 
-def ascent_cone_radius_m(c: Context) -> float:
+def ascent_cone_radius_at_gear_m(c: Context) -> float:
     """Return the radius of the approach cone at the gear's present height, m: the largest allowed
     horizontal distance of the gear from the target's axis. It is `ascend.cone_base_m` at the target
     and grows by `ascend.cone_slope` per metre below it."""
@@ -125,7 +125,7 @@ def is_target_lost(c: Context) -> bool:
     return not b.target.is_tracked and b.target.age_s > patience_s
 
 
-NEAR_STANDOFF_HEIGHT = Condition[Context](
+ASCENT_END_HEIGHT_REACHED = Condition[Context](
     "near the stand-off", lambda c: c.belief.target.is_tracked and has_reached_ascent_end_height(c)
 )
 """The gear is at the stand-off below a tracked target."""
@@ -156,7 +156,7 @@ def act_in_ascend(c: Context) -> Action:
     may_climb = (
         target.is_fresh
         and target.gear_to_target_distance_xy_m
-        < MAX_OFFSET_TO_CONE_RADIUS_RATIO_TO_CLIMB * ascent_cone_radius_m(c)
+        < MAX_OFFSET_TO_CONE_RADIUS_RATIO_TO_CLIMB * ascent_cone_radius_at_gear_m(c)
     )
     lag_m = setpoint.z_m - c.telemetry.position_m[2]
     speed = ascend.near_speed_mps if target.gear_to_target_z_m < ascend.near_m else ascend.speed_mps
@@ -181,7 +181,7 @@ ASCEND = PhaseDefinition(
     ),
     enter=enter_ascend,
     act=act_in_ascend,
-    conditions=(NEAR_STANDOFF_HEIGHT, SETTLED_AT_STANDOFF, AT_HOVER_POSITION),
+    timed_conditions=(ASCENT_END_HEIGHT_REACHED, SETTLED_AT_STANDOFF, AT_HOVER_POSITION),
     exits=(
         back_off_row(
             "ascend-lost",
@@ -192,7 +192,9 @@ ASCEND = PhaseDefinition(
         Transition(
             "outside-cone",
             {Phase.ASCEND},
-            lambda c: c.belief.target.gear_to_target_distance_xy_m > ascent_cone_radius_m(c),
+            lambda c: (
+                c.belief.target.gear_to_target_distance_xy_m > ascent_cone_radius_at_gear_m(c)
+            ),
             Phase.ALIGN,
             "drifted out of the ascent cone",
             Severity.HOLD,
@@ -202,7 +204,7 @@ ASCEND = PhaseDefinition(
             {Phase.ASCEND},
             lambda c: (
                 c.time_in_phase_s > c.planner.ascend.timeout_s
-                or c.true_for_s(NEAR_STANDOFF_HEIGHT) > c.planner.ascend.settle_timeout_s
+                or c.true_for_s(ASCENT_END_HEIGHT_REACHED) > c.planner.ascend.settle_timeout_s
             ),
             "did not settle under the target",
         ),

@@ -36,7 +36,7 @@ ESTIMATE = PhaseDefinition(
         is_in_free_air=True, is_camera_guided=True, requires_pictures=True, learns_hover_thrust=True
     ),
     act=act_in_estimate,
-    conditions=(TARGET_UNTRACKED, TARGET_POSITION_STEADY),
+    timed_conditions=(TARGET_UNTRACKED, TARGET_POSITION_STEADY),
     exits=(
         Transition(
             "estimate-lost",

@@ -3,7 +3,7 @@
 Up to ASCEND, the mission is the same as for a perch, but ASCEND ends at the hover position instead
 of the stand-off. HOVER itself never climbs. A vehicle that sinks below its hover position, for
 example because the estimated height drifts, climbs back in ASCEND; the hover timer continues if
-that takes at most `MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S`. A vehicle that leaves its
+that takes at most `MAX_HEIGHT_RETURN_DURATION_TO_KEEP_HOVER_TIMER_S`. A vehicle that leaves its
 hover position returns to ALIGN, and the timer restarts. In a completed hover, the vehicle has
 therefore kept its position for the whole time, apart from such climbs.
 """
@@ -16,7 +16,7 @@ from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Outcome, Phase, Severity, VehicleDiagnosis
 from perchctl.mission.phases.ascend import (
-    ascent_cone_radius_m,
+    ascent_cone_radius_at_gear_m,
     is_returning_to_hover_height,
     is_target_lost,
 )
@@ -36,7 +36,7 @@ estimated height moves the vehicle further. Smaller: the noise of the target's h
 back needlessly."""
 SUNK_BELOW_HOVER_HEIGHT_DWELL_S = 0.3
 """Time for which the vehicle must be too low before it climbs back, s."""
-MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S = 5.0
+MAX_HEIGHT_RETURN_DURATION_TO_KEEP_HOVER_TIMER_S = 5.0
 """Longest duration of a climb back to the hover position after which the hover timer continues, s.
 Larger: a weak vehicle counts as hovering although it is too low. Smaller: a climb in wind restarts
 the timer."""
@@ -68,10 +68,10 @@ def time_since_hover_began_s(c: Context) -> float:
 def enter_hover(state: PlannerState, previous_context: Context) -> PlannerState:
     """Restart the hover timer and the position errors. Both continue if `previous_context`, the
     context before the transition in the same tick, shows that the vehicle has only climbed back to
-    its hover position, within `MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S`."""
+    its hover position, within `MAX_HEIGHT_RETURN_DURATION_TO_KEEP_HOVER_TIMER_S`."""
     if (
         is_returning_to_hover_height(previous_context.state)
-        and previous_context.time_in_phase_s <= MAX_RETURN_TO_HOVER_HEIGHT_DURATION_S
+        and previous_context.time_in_phase_s <= MAX_HEIGHT_RETURN_DURATION_TO_KEEP_HOVER_TIMER_S
     ):
         return state
     return replace(state, hover_errors=HoverErrors(state.entry.t_s, state.entry.t_s))
@@ -92,11 +92,11 @@ def distance_below_hover_height_m(c: Context) -> float:
 
 def has_left_hover_position(c: Context) -> bool:
     """True if the gear's offset from the target's axis exceeds the radius of the approach cone
-    (`ascent_cone_radius_m`), or its height differs from the hover height by more than
+    (`ascent_cone_radius_at_gear_m`), or its height differs from the hover height by more than
     `MAX_HOVER_HEIGHT_ERROR_M`."""
     lateral_m = c.belief.target.gear_to_target_distance_xy_m
     return (
-        lateral_m > ascent_cone_radius_m(c)
+        lateral_m > ascent_cone_radius_at_gear_m(c)
         or abs(distance_below_hover_height_m(c)) > MAX_HOVER_HEIGHT_ERROR_M
     )
 
@@ -124,7 +124,7 @@ HOVER = PhaseDefinition(
     ),
     enter=enter_hover,
     act=act_in_hover,
-    conditions=(SUNK_BELOW_HOVER_HEIGHT,),
+    timed_conditions=(SUNK_BELOW_HOVER_HEIGHT,),
     exits=(
         back_off_row(
             "hover-lost",

@@ -14,7 +14,7 @@ from perchctl.mission.transition import Predicate, Transition, abort_during_land
 from perchctl.values import replace
 from perchctl.vehicle import FLYING, FRESH_S
 
-TARGET_RECHECK_DURATION_AFTER_MOTOR_STOP_S = 2.0
+REST_STATE_TIMEOUT_AFTER_MOTORS_OFF_S = 2.0
 """Time after the motors stop during which a picture may still show that the target is far above the
 vehicle, s."""
 
@@ -78,7 +78,7 @@ def unconfirmed_landing_reason(c: Context) -> str:
     return f"the landing was not confirmed in time: {cause}"
 
 
-def _outcome_after_hanging(previous_outcome: Outcome | None) -> Outcome | None:
+def _outcome_if_landing_ends_hanging(previous_outcome: Outcome | None) -> Outcome | None:
     """Return the outcome of a flight that ends on the magnet. TARGET_NOT_FOUND becomes
     ATTEMPTS_USED_UP, since the vehicle is hanging on a target; HOVERED becomes SAFETY, since a
     hover must not end on the magnet; other outcomes are kept."""
@@ -103,7 +103,7 @@ LANDING = PhaseDefinition(
             make_rest_state_predicate(RestState.HANGS),
             Phase.PERCHED,
             "hanging with the motors off",
-            outcome=_outcome_after_hanging,
+            outcome=_outcome_if_landing_ends_hanging,
         ),
         Transition(
             "landed",
@@ -128,7 +128,7 @@ LANDING = PhaseDefinition(
         abort_during_landing_row(
             "hangs-or-stands",
             lambda c: (
-                c.true_for_s(MOTORS_OFF_AS_COMMANDED) >= TARGET_RECHECK_DURATION_AFTER_MOTOR_STOP_S
+                c.true_for_s(MOTORS_OFF_AS_COMMANDED) >= REST_STATE_TIMEOUT_AFTER_MOTORS_OFF_S
             ),
             "motors off; no telemetry arrived for so long that a fall may have gone unnoticed, so "
             "it is unknown whether the vehicle is hanging or on the floor: look before you touch "

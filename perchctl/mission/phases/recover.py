@@ -24,27 +24,27 @@ from perchctl.mission.release import (
 )
 from perchctl.mission.setpoints import (
     Action,
-    body_world_xy_under_target,
     fly_to,
     make_setpoint_at_vehicle,
     step_setpoint_towards,
+    vehicle_world_xy_with_gear_under_target_m,
 )
 from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Transition, land_row
 from perchctl.values import replace
 from perchctl.vehicle import PositionSetpoint
 
-MIN_THRUST_TO_HOVER_RATIO_TO_SKIP_CATCH = 0.85
+MIN_THRUST_TO_HOVER_RATIO_TO_SKIP_FALL_CATCH = 0.85
 """Fraction of the hover thrust above which a slipping vehicle is sinking so slowly that it needs no
 catch."""
-MIN_DISTANCE_BELOW_CONTACT_TO_RECOVER_M = 0.05
+MIN_DESCENT_TO_COUNT_AS_DETACHED_M = 0.05
 """Distance below the contact beyond which the vehicle has left it, m; at most half of the descent
 is used."""
 MAX_SIGHTING_AGE_TO_FOLLOW_TARGET_S = 3.0
 """Largest age of a sighting at which the vehicle still follows the target, s."""
 RECOVERY_DURATION_AFTER_LAST_ATTEMPT_S = 0.5
 """Time for which the vehicle recovers before the last failed attempt ends the flight, s."""
-SETPOINT_STEP_DOWN_RATE_MPS = 10.0
+RECOVERY_SETPOINT_SINK_RATE_MPS = 10.0
 """Downward speed of the setpoint, m/s: so high that the setpoint reaches its goal at once."""
 
 STEADY_AFTER_ATTEMPT = Condition[Context](
@@ -64,7 +64,7 @@ def enter_recover(state: PlannerState, previous_context: Context) -> PlannerStat
     # A vehicle whose motors carry most of its weight hardly falls.
     falls = (
         VehicleDiagnosis.SLIPPED_OFF_CONTACT in diagnosis
-        and thrust < MIN_THRUST_TO_HOVER_RATIO_TO_SKIP_CATCH * b.hover_thrust
+        and thrust < MIN_THRUST_TO_HOVER_RATIO_TO_SKIP_FALL_CATCH * b.hover_thrust
     )
     belief = replace(
         state.belief,
@@ -124,7 +124,7 @@ def act_in_recover(c: Context) -> Action:
     if (caught := catch_falling_vehicle(c)) is not None:
         return caught
     recover = c.planner.recover
-    least_m = min(MIN_DISTANCE_BELOW_CONTACT_TO_RECOVER_M, 0.5 * recover.descend_m)
+    least_m = min(MIN_DESCENT_TO_COUNT_AS_DETACHED_M, 0.5 * recover.descend_m)
     # During a contact that lasts several seconds, the estimate may drift downwards by this much. In
     # this phase, the vehicle itself must have descended.
     if c.state.entry.position_m[2] - c.telemetry.position_m[2] >= least_m:
@@ -144,13 +144,13 @@ def act_in_recover(c: Context) -> Action:
         setpoint = replace(setpoint, z_m=z)
     target = c.belief.target
     if target.world_position_m is not None and target.age_s < MAX_SIGHTING_AGE_TO_FOLLOW_TARGET_S:
-        x, y = body_world_xy_under_target(c, setpoint.yaw_rad)
+        x, y = vehicle_world_xy_with_gear_under_target_m(c, setpoint.yaw_rad)
         goal = PositionSetpoint(x, y, z, setpoint.yaw_rad)
     else:
         goal = replace(setpoint, z_m=z)
     c = Context(replace(state, setpoint=setpoint))
     return fly_to(
-        c, step_setpoint_towards(c, setpoint, goal, max_down_mps=SETPOINT_STEP_DOWN_RATE_MPS)
+        c, step_setpoint_towards(c, setpoint, goal, max_down_mps=RECOVERY_SETPOINT_SINK_RATE_MPS)
     )
 
 
@@ -182,7 +182,7 @@ RECOVER = PhaseDefinition(
     maneuver=Maneuver(is_in_free_air=True, is_camera_guided=True, retreats_after_attempt=True),
     enter=enter_recover,
     act=act_in_recover,
-    conditions=(STEADY_AFTER_ATTEMPT,),
+    timed_conditions=(STEADY_AFTER_ATTEMPT,),
     exits=(
         land_row(
             "attempts-used",

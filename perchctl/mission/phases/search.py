@@ -11,10 +11,10 @@ from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Outcome, Phase
 from perchctl.mission.setpoints import (
     Action,
-    body_world_xy_under_target,
     fly_to,
     make_setpoint_at_vehicle,
     step_setpoint_towards,
+    vehicle_world_xy_with_gear_under_target_m,
 )
 from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Transition, land_row
@@ -54,7 +54,7 @@ def act_in_search(c: Context) -> Action:
         c = Context(state)
     x, y, z = state.entry.position_m
     if b.target.world_position_m is not None:
-        there = body_world_xy_under_target(c, state.entry.yaw_rad)
+        there = vehicle_world_xy_with_gear_under_target_m(c, state.entry.yaw_rad)
         unconfirmed = b.mounting.is_target_motion_undetermined
         x, y = (
             _limit_move_before_camera_mounting_check(b.mounting, (x, y), there)

@@ -7,7 +7,7 @@ drawing correlates best with the image I:
 
 Without an expected marker, the fits start at the quadrilaterals whose cells correlate best with the
 drawing. Any start is safe because the photometric fit measures the corners and verifies the marker
-(`is_alignment_confirmed`, `excludes_other_codewords`).
+(`is_alignment_confirmed`, `are_other_codewords_excluded`).
 
 The result is wrong whenever the photometric fit is wrong
 (`perchctl.vision.markers.photometric_fit`). The result is empty if another codeword would look the
@@ -32,7 +32,7 @@ from perchctl.vision.markers.corners import (
     is_inside_image,
     mean_side_px,
     side_lengths_px,
-    signed_double_area,
+    signed_double_area_clockwise,
 )
 from perchctl.vision.markers.detector import DetectorInput, make_quad_detector
 from perchctl.vision.markers.edge_fit import (
@@ -49,41 +49,45 @@ from perchctl.vision.markers.photometric_fit import DrawingAlignment, align_draw
 from perchctl.vision.types import MARKERS, MarkerName
 
 # Initial guesses of the blur: at an expected position, and at a quadrilateral found in the image.
-_START_BLURS_PX, _FIRST_BLUR_PX = (1.5, 3.0), 2.0
+_INITIAL_BLUR_SIGMAS_PX, _QUAD_INITIAL_BLUR_SIGMA_PX = (1.5, 3.0), 2.0
 # Largest error of a marker's expected position.
-_MAX_POSITION_ERROR_PX, _MAX_POSITION_ERROR_SIDES = 10.0, 0.5
-_MAX_TEMPLATE_PX, _MIN_TEMPLATE_PX = 96.0, 6
+_MAX_EXPECTED_POSITION_ERROR_PX, _MAX_EXPECTED_POSITION_ERROR_SIDES = 10.0, 0.5
+_MAX_TEMPLATE_SIZE_PX, _MIN_TEMPLATE_SIZE_PX = 96.0, 6
 _MIN_QUAD_CORRELATION = 0.5
 # Minimum correlation at an expected position. Textures seldom reach this correlation; each texture
 # that does costs the time of a fit.
 _MIN_EXPECTED_MARKER_CORRELATION = 0.45
 _MAX_QUADS_TO_FIT = 3
 # Whiteness, 0 to 1, of areas with unknown content: inside the marker, and beyond the paper.
-_CENTRE_GREY, _OUTSIDE_GREY = 0.3, 0.6
+_TEMPLATE_CENTRE_WHITENESS, _TEMPLATE_OUTSIDE_WHITENESS = 0.3, 0.6
 # Candidates closer to each other than this fraction of a side count as one.
 _MAX_DUPLICATE_DISTANCE_SIDES = 0.15
 # Distance from the marker's centre up to which the surroundings are certainly paper.
 _MIN_PAPER_REACH_HALF_SIDES = 1.3
 
 
-def find_expected_blurred(
+def find_expected_blurred_marker(
     detector_input: DetectorInput,
     expected_corners_px: Mapping[MarkerName, Array],
-    frame_counter_for_initial_blur: int | None = None,
+    initial_blur_alternation_counter: int | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
     """Find blurred markers near their expected corners (4, 2) px in the image. Each marker is
     shifted to where its drawing correlates best with the image, and then fitted (`align_marker`).
     Return the first marker that the fit confirms, or an empty dict if there is none.
 
-    The caller increments `frame_counter_for_initial_blur` with each frame. To save time, the fits
+    The caller increments `initial_blur_alternation_counter` with each frame. To save time, the fits
     start with a small blur if the counter is even and with a large blur if it is odd. If the
     counter is None, both are tried in this frame.
     """
     image, patterns = detector_input.image, detector_input.setup.patterns
     blurs_px = (
-        _START_BLURS_PX
-        if frame_counter_for_initial_blur is None
-        else (_START_BLURS_PX[frame_counter_for_initial_blur % len(_START_BLURS_PX)],)
+        _INITIAL_BLUR_SIGMAS_PX
+        if initial_blur_alternation_counter is None
+        else (
+            _INITIAL_BLUR_SIGMAS_PX[
+                initial_blur_alternation_counter % len(_INITIAL_BLUR_SIGMAS_PX)
+            ],
+        )
     )
     for name in MARKERS:
         corners = expected_corners_px.get(name)
@@ -104,7 +108,7 @@ def find_expected_blurred(
     return {}
 
 
-def find_blurred(detector_input: DetectorInput) -> dict[MarkerName, RefinedCorners]:
+def find_blurred_marker(detector_input: DetectorInput) -> dict[MarkerName, RefinedCorners]:
     """Find a blurred marker anywhere in the image. The photometric fit is tried on the
     quadrilaterals whose cells correlate best with a marker's. Return the first marker that the fit
     confirms, or an empty dict if there is none."""
@@ -112,7 +116,9 @@ def find_blurred(detector_input: DetectorInput) -> dict[MarkerName, RefinedCorne
     corners, _, others, _ = make_quad_detector(setup).detectMarkersMultiDict(image)
     quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
     for name, corners_px in _rank_quads(image, quads, setup.patterns):
-        seen = align_marker(detector_input, name, corners_px, initial_blur_sigma_px=_FIRST_BLUR_PX)
+        seen = align_marker(
+            detector_input, name, corners_px, initial_blur_sigma_px=_QUAD_INITIAL_BLUR_SIGMA_PX
+        )
         if seen is not None:
             return {name: seen}
     return {}
@@ -158,8 +164,8 @@ def _align_by_correlation(
     px or half a side in each direction, whichever is larger. If the image leaves no room for a
     search, the corners are returned unchanged."""
     side_px = mean_side_px(corners_px)
-    scale = min(1.0, _MAX_TEMPLATE_PX / (2.0 * side_px))
-    reach = max(_MAX_POSITION_ERROR_PX, _MAX_POSITION_ERROR_SIDES * side_px)
+    scale = min(1.0, _MAX_TEMPLATE_SIZE_PX / (2.0 * side_px))
+    reach = max(_MAX_EXPECTED_POSITION_ERROR_PX, _MAX_EXPECTED_POSITION_ERROR_SIDES * side_px)
     centre = corners_px.mean(axis=0)
     half = float(np.abs(corners_px - centre).max()) * _MIN_PAPER_REACH_HALF_SIDES
     h, w = image.shape
@@ -173,7 +179,7 @@ def _align_by_correlation(
     size = int(np.ceil(2.0 * half * scale))
     middle = local.mean(axis=0)
     first = np.floor(middle - 0.5 * (size - 1))
-    if min(patch.shape) <= size or size < _MIN_TEMPLATE_PX:
+    if min(patch.shape) <= size or size < _MIN_TEMPLATE_SIZE_PX:
         return corners_px
     grid = np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).astype(np.float64)
     template = _render_template(
@@ -201,9 +207,9 @@ def _render_template(
     if pattern.drawing.small_marker_cell_whiteness is not None:
         white[
             np.abs(sample_points_half_sides).max(axis=2) < pattern.drawing.small_to_large_side_ratio
-        ] = _CENTRE_GREY
+        ] = _TEMPLATE_CENTRE_WHITENESS
     white[np.abs(sample_points_half_sides).max(axis=2) > _MIN_PAPER_REACH_HALF_SIDES] = (
-        _OUTSIDE_GREY
+        _TEMPLATE_OUTSIDE_WHITENESS
     )
     sigma = max(1.0, 0.5 * side_px / n)
     return np.asarray(cv2.GaussianBlur(white.astype(np.float32), (0, 0), sigma))
@@ -216,14 +222,14 @@ _MIN_ALIGNED_CORNER_SIGMA_PX = 0.015
 # The error of the corners grows with the blur, because no image equals its drawing with a uniform
 # blur.
 _CORNER_SIGMA_TO_BLUR_SIGMA_RATIO = 0.012
-_MIN_INNER_CORRELATION, _MIN_CORRELATION = 0.9, 0.9
-_MIN_PATTERN_CONTRAST, _MAX_PATTERN_CONTRAST = 0.6, 1.6
+_MIN_PATTERN_CORRELATION, _MIN_FIT_CORRELATION = 0.9, 0.9
+_MIN_PATTERN_TO_BORDER_CONTRAST_RATIO, _MAX_PATTERN_TO_BORDER_CONTRAST_RATIO = 0.6, 1.6
 _MAX_CELL_GREY_DEVIATION_TO_CONTRAST_RATIO = 0.3
 _MAX_CELL_FLIP_FRACTION, _MAX_CELL_FLIP_FRACTION_SIGMA = 0.4, 0.35
 _MAX_ALIGNED_CORNER_SIGMA_SIDES = 0.06
 _ALWAYS_ALLOWED_MOTION_FROM_START_PX = 3.0
 # Limits of the mean side after the fit, divided by the mean side at its start.
-_MIN_SIZE_RATIO, _MAX_SIZE_RATIO = 0.6, 1.6
+_MIN_FITTED_TO_START_SIDE_RATIO, _MAX_FITTED_TO_START_SIDE_RATIO = 0.6, 1.6
 _MIN_SHORTEST_TO_LONGEST_SIDE_RATIO = 0.6
 
 
@@ -243,7 +249,7 @@ def align_marker(
     `initial_blur_sigma_px` (standard deviation). `max_motion_from_start_sides` limits the distance
     of the fitted corners from the start, and `max_corner_sigma_sides` limits their standard
     deviation; both are in side lengths. If `must_exclude_other_codewords` is True, the image must
-    also exclude every other codeword (`excludes_other_codewords`); set it to False if the other
+    also exclude every other codeword (`are_other_codewords_excluded`); set it to False if the other
     marker already identifies this one.
     """
     side_px = mean_side_px(start_corners_px)
@@ -256,7 +262,7 @@ def align_marker(
     if (
         alignment is None
         or not is_alignment_confirmed(alignment, max_corner_sigma_sides)
-        or (must_exclude_other_codewords and not excludes_other_codewords(alignment))
+        or (must_exclude_other_codewords and not are_other_codewords_excluded(alignment))
         or alignment.largest_motion_from_start_px
         > max(max_motion_from_start_sides * side_px, _ALWAYS_ALLOWED_MOTION_FROM_START_PX)
     ):
@@ -268,8 +274,10 @@ def align_marker(
     )
     if (
         sides_px.min() < _MIN_SHORTEST_TO_LONGEST_SIDE_RATIO * sides_px.max()
-        or not _MIN_SIZE_RATIO < float(sides_px.mean()) / side_px < _MAX_SIZE_RATIO
-        or np.prod(signed_double_area(np.stack(areas))) <= 0.0
+        or not _MIN_FITTED_TO_START_SIDE_RATIO
+        < float(sides_px.mean()) / side_px
+        < _MAX_FITTED_TO_START_SIDE_RATIO
+        or np.prod(signed_double_area_clockwise(np.stack(areas))) <= 0.0
     ):
         return None
     sigma_px = math.hypot(
@@ -299,18 +307,18 @@ def is_alignment_confirmed(
     contrast; if there is one, it is above 0.95.
     """
     return (
-        alignment.pattern_correlation > _MIN_INNER_CORRELATION
-        and alignment.fit_correlation > _MIN_CORRELATION
-        and _MIN_PATTERN_CONTRAST
+        alignment.pattern_correlation > _MIN_PATTERN_CORRELATION
+        and alignment.fit_correlation > _MIN_FIT_CORRELATION
+        and _MIN_PATTERN_TO_BORDER_CONTRAST_RATIO
         < alignment.pattern_to_border_contrast_ratio
-        < _MAX_PATTERN_CONTRAST
+        < _MAX_PATTERN_TO_BORDER_CONTRAST_RATIO
         and alignment.largest_cell_grey_deviation_to_contrast_ratio
         < _MAX_CELL_GREY_DEVIATION_TO_CONTRAST_RATIO
         and alignment.sigma_px < max_corner_sigma_sides * mean_side_px(alignment.corners_px)
     )
 
 
-def excludes_other_codewords(alignment: DrawingAlignment) -> bool:
+def are_other_codewords_excluded(alignment: DrawingAlignment) -> bool:
     """True if flipping any single bit of the codeword would make the drawing fit the image clearly
     worse. How much a cell looks like the opposite colour is measured from 0 (as drawn) to 1
     (flipped). For the worst cell, this `worst_cell_flip_fraction` must be below

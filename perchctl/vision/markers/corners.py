@@ -94,18 +94,20 @@ def mean_side_px(corners_px: Array) -> float:
     return (math.dist(a, b) + math.dist(b, c) + math.dist(c, d) + math.dist(d, a)) / 4.0
 
 
-def signed_double_area(corners: Array) -> Array:
+def signed_double_area_clockwise(corners: Array) -> Array:
     """Return twice the signed area (m,) of m quadrilaterals with corners (m, 4, 2), in squared
     units of the corners; positive if the corners are clockwise in the image (x right, y down)."""
     a, b = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
-def is_inside_image(corners_px: Array, shape: tuple[int, ...], margin_px: float = 0.0) -> bool:
+def is_inside_image(
+    corners_px: Array, image_shape: tuple[int, ...], margin_px: float = 0.0
+) -> bool:
     """True if all corners (4, 2) are at least `margin_px` inside the border of an image with the
-    given `shape` (h, w). With a negative margin, corners may be outside the image by that
+    given `image_shape` (h, w). With a negative margin, corners may be outside the image by that
     distance. False if a corner is NaN."""
-    h, w = shape[:2]
+    h, w = image_shape[:2]
     right, low = w - 1 - margin_px, h - 1 - margin_px
     # NaN yields False.
     return all(margin_px <= x <= right and margin_px <= y <= low for x, y in corners_px.tolist())

@@ -49,27 +49,27 @@ from perchctl.vision.markers.detector import (
 )
 from perchctl.vision.markers.edge_fit import GRADIENT_POSITIONS_HALF_LENGTHS, sample_profiles
 from perchctl.vision.markers.pattern import MarkerDrawing, MarkerPattern, render_cells
-from perchctl.vision.markers.photometric_fit import fit_correlation, make_sampling_grid
+from perchctl.vision.markers.photometric_fit import correlation_from_residual, make_sampling_grid
 from perchctl.vision.types import CameraModel, MarkerName
 
 MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S = 0.5
 """Maximum time since the target was last measured, s. After a longer time, a part of the target is
 not sufficient evidence of the target."""
 # Distance from the image border within which an expected marker may or may not be truncated.
-_UNCERTAIN_TRUNCATION_MARGIN_PX = 40
+_MAX_EXPECTED_CORNER_ERROR_PX = 40
 # If the cells of the small marker are smaller, the large marker is in view.
 _MIN_SMALL_MARKER_CELL_PX = 8.0
 _MIN_COARSE_CORRELATION = 0.6  # Correlation required after the predicted pose has been shifted.
 _SUFFICIENT_COARSE_CORRELATION = 0.95  # Correlation above which no other range is tried.
 # Sizes of the target in the image that are tried, relative to its predicted size.
-_RANGE_SCALE_CANDIDATES = (1.0, 0.94, 1.06)
-_MIN_CORRELATION, _MIN_TRUNCATED_CONTRAST_GREY = 0.9, 20.0
+_TARGET_IMAGE_SCALE_CANDIDATES = (1.0, 0.94, 1.06)
+_MIN_FITTED_DRAWING_CORRELATION, _MIN_TRUNCATED_CONTRAST_GREY = 0.9, 20.0
 _MIN_FOUND_EDGE_POINT_FRACTION = 0.75  # fraction of the edge points in view that must be found
-_MAX_TRUNCATED_FIT_RESIDUAL_PX = 1.2
-_MAX_CENTRE_SIGMA_HALF_SIDES = 0.04
+_MAX_TRUNCATED_FIT_RMS_RESIDUAL_PX = 1.2
+_MAX_TRANSLATION_SIGMA_HALF_SIDES = 0.04
 _MIN_CORNER_SIGMA_PX = 0.02
 # The small marker is reported if at least this number of its edge points is found.
-_MIN_SMALL_MARKER_EDGE_POINTS = 12
+_MIN_EDGE_POINTS_TO_REPORT_SMALL_MARKER = 12
 # The lens model is valid where its inverse exists.
 _MAX_LENS_INVERSION_ERROR_NORMALISED = 1e-3
 # Rotation from the coordinates of the drawing to the axes of the marker.
@@ -88,23 +88,23 @@ def warm_up_truncated_marker_fit(
     )
 
 
-def is_target_truncated(
+def is_target_possibly_truncated(
     expected_corners_px: Mapping[MarkerName, Array],
-    shape: tuple[int, ...],
+    image_shape: tuple[int, ...],
     hidden_mask: HiddenMask | None = None,
 ) -> bool:
     """True if no expected marker is certain to be completely visible: each has a corner that is
-    outside the image or less than `_UNCERTAIN_TRUNCATION_MARGIN_PX` from its border, or the
+    outside the image or less than `_MAX_EXPECTED_CORNER_ERROR_PX` from its border, or the
     vehicle's gear hides a part of it. False if no marker is expected.
 
     `expected_corners_px` contains the predicted corners of each marker, (4, 2) px.
-    `shape` (h, w) is that of the image. `hidden_mask` (h, w) is True for pixels that the
+    `image_shape` (h, w) is that of the image. `hidden_mask` (h, w) is True for pixels that the
     gear hides.
     """
     whole = [
         corners
         for corners in expected_corners_px.values()
-        if is_inside_image(corners, shape, _UNCERTAIN_TRUNCATION_MARGIN_PX)
+        if is_inside_image(corners, image_shape, _MAX_EXPECTED_CORNER_ERROR_PX)
     ]
     return bool(expected_corners_px) and all(
         is_any_marker_part_hidden(hidden_mask, c) for c in whole
@@ -112,13 +112,13 @@ def is_target_truncated(
 
 
 def can_complete_marker_be_in_view(
-    expected_corners_px: Mapping[MarkerName, Array], shape: tuple[int, ...]
+    expected_corners_px: Mapping[MarkerName, Array], image_shape: tuple[int, ...]
 ) -> bool:
     """True if at least one expected marker, with corners (4, 2) px, may be completely in an image
-    with the given `shape` (h, w): because predictions are uncertain, its corners may be up to
-    `_UNCERTAIN_TRUNCATION_MARGIN_PX` outside the image."""
+    with the given `image_shape` (h, w): because predictions are uncertain, its corners may be up to
+    `_MAX_EXPECTED_CORNER_ERROR_PX` outside the image."""
     return any(
-        is_inside_image(corners, shape, -_UNCERTAIN_TRUNCATION_MARGIN_PX)
+        is_inside_image(corners, image_shape, -_MAX_EXPECTED_CORNER_ERROR_PX)
         for corners in expected_corners_px.values()
     )
 
@@ -145,7 +145,7 @@ def fit_truncated_markers(
         drawing.small_to_large_side_ratio,
         drawing.small_marker_cell_whiteness,
     )
-    start = _initial_pose(expected_corners_px, small_to_large_side_ratio, camera)
+    start = _estimate_initial_pose(expected_corners_px, small_to_large_side_ratio, camera)
     if start is None or centre is None:
         return {}
     if (
@@ -168,7 +168,7 @@ def fit_truncated_markers(
     if pose_fit is None or not _is_pose_fit_reliable(pose_fit):
         return {}
     like, gain = correlate_drawing(pose_fit.pose.H_normalised_drawing, texture, coarse_image)
-    if like < _MIN_CORRELATION or gain < _MIN_TRUNCATED_CONTRAST_GREY:
+    if like < _MIN_FITTED_DRAWING_CORRELATION or gain < _MIN_TRUNCATED_CONTRAST_GREY:
         return {}
     name = _select_marker_to_report(pose_fit)
     corners = _project_marker_corners(
@@ -177,7 +177,7 @@ def fit_truncated_markers(
     return {} if corners is None else {name: corners}
 
 
-def shows_enough_of_target(
+def can_fit_truncated_target(
     R_cam_marker: Array, t_cam_marker_m: Array, target: TargetConfig, camera: CameraModel
 ) -> bool:
     """True if the visible part of the target is large enough for a measurement: if the fit of
@@ -219,12 +219,12 @@ def _select_marker_to_report(pose_fit: PoseFit) -> MarkerName:
     the large one."""
     return (
         "small"
-        if pose_fit.found_small_marker_point_count >= _MIN_SMALL_MARKER_EDGE_POINTS
+        if pose_fit.found_small_marker_point_count >= _MIN_EDGE_POINTS_TO_REPORT_SMALL_MARKER
         else "large"
     )
 
 
-def _initial_pose(
+def _estimate_initial_pose(
     expected_corners_px: Mapping[MarkerName, Array],
     small_to_large_side_ratio: float,
     camera: CameraModel,
@@ -252,25 +252,25 @@ def _search_near_pose(
     """Return the pose near `start` at which the drawing, rendered from `texture`, correlates best
     with the coarse image; None if the correlation is below `_MIN_COARSE_CORRELATION` everywhere.
 
-    The search covers `_SEARCH_RANGE_NODES` lattice nodes in each direction of the image
-    and the sizes in `_RANGE_SCALE_CANDIDATES`. The rotation is not changed. The search
+    The search covers `_SEARCH_HALF_WIDTH_NODES` lattice nodes in each direction of the image
+    and the sizes in `_TARGET_IMAGE_SCALE_CANDIDATES`. The rotation is not changed. The search
     stops at the first size at which the correlation exceeds `_SUFFICIENT_COARSE_CORRELATION`.
     """
     best, pose, lattice = _MIN_COARSE_CORRELATION, None, coarse_image.lattice
-    for growth in _RANGE_SCALE_CANDIDATES:
+    for growth in _TARGET_IMAGE_SCALE_CANDIDATES:
         t = start.t_cam_drawing_half_sides * (1.0, 1.0, 1.0 / growth)
         wide = render_drawing(
             RigidPose(start.R_cam_drawing, t).H_normalised_drawing,
             texture,
             lattice,
-            _SEARCH_RANGE_NODES,
+            _SEARCH_HALF_WIDTH_NODES,
         )
         mask = coarse_image.is_visible.astype(np.float32)
         score = cv2.matchTemplate(wide, coarse_image.grey, cv2.TM_CCOEFF_NORMED, mask=mask)
         score = np.where(np.isfinite(score) & (np.abs(score) <= 1.001), score, -1.0)
         row, column = np.unravel_index(int(score.argmax()), score.shape)
         drift = (
-            _SEARCH_RANGE_NODES - np.array([column, row], dtype=np.float64)
+            _SEARCH_HALF_WIDTH_NODES - np.array([column, row], dtype=np.float64)
         ) * lattice.node_spacing_normalised
         if score[row, column] > best:
             best = float(score[row, column])
@@ -282,16 +282,16 @@ def _search_near_pose(
 
 def _is_pose_fit_reliable(pose_fit: PoseFit) -> bool:
     """True if at least `_MIN_FOUND_EDGE_POINT_FRACTION` of the visible edge points were found,
-    their RMS residual is below `_MAX_TRUNCATED_FIT_RESIDUAL_PX`, and the standard deviation
+    their RMS residual is below `_MAX_TRUNCATED_FIT_RMS_RESIDUAL_PX`, and the standard deviation
     of the translation along its most uncertain direction is below
-    `_MAX_CENTRE_SIGMA_HALF_SIDES` (half sides of the large marker)."""
+    `_MAX_TRANSLATION_SIGMA_HALF_SIDES` (half sides of the large marker)."""
     spread = math.sqrt(
         max(float(np.linalg.eigvalsh(pose_fit.rotation_translation_cov[3:, 3:])[-1]), 0.0)
     )
     return (
         pose_fit.found_point_count >= _MIN_FOUND_EDGE_POINT_FRACTION * pose_fit.visible_point_count
-        and pose_fit.rms_residual_px < _MAX_TRUNCATED_FIT_RESIDUAL_PX
-        and spread < _MAX_CENTRE_SIGMA_HALF_SIDES
+        and pose_fit.rms_residual_px < _MAX_TRUNCATED_FIT_RMS_RESIDUAL_PX
+        and spread < _MAX_TRANSLATION_SIGMA_HALF_SIDES
     )
 
 
@@ -337,9 +337,9 @@ _LATTICE_COLUMNS = 80  # approximate number of nodes across the image
 _SAMPLES_PER_LATTICE_NODE_AND_AXIS = 2
 _MAX_VIEW_RADIUS_NORMALISED = 1.5  # corresponds to 56 degrees off the optical axis
 _BORDER_POINTS_PER_IMAGE_SIDE = 40
-_VALID_LENS_TO_IMAGE_RADIUS_RATIO = 1.02
-_SEARCH_RANGE_NODES = 6  # The search covers this number of nodes to each side.
-_MIN_VISIBLE_PAPER_NODES = 200  # Minimum number of visible nodes on the paper.
+_VALID_LENS_RADIUS_TO_IMAGE_RADIUS_RATIO = 1.02
+_SEARCH_HALF_WIDTH_NODES = 6  # The search covers this number of nodes to each side.
+_MIN_VISIBLE_NODES_ON_PAPER = 200  # Minimum number of visible nodes on the paper.
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,7 +352,7 @@ class CoarseLattice:
         node_spacing_normalised: distance between neighbouring nodes.
         valid_radius_normalised: distance from the optical axis up to which the lens model is used;
             further out, it may map two directions to the same pixel.
-        map_x_px, map_y_px: maps for cv2.remap, with the position of each sample in the reduced
+        remap_x_px, remap_y_px: maps for cv2.remap, with the position of each sample in the reduced
             image.
         reduced_image_size_px: width and height of the reduced image.
         is_in_image: True for nodes inside the image, (rows, columns).
@@ -361,8 +361,8 @@ class CoarseLattice:
     first_node_normalised: Array
     node_spacing_normalised: float
     valid_radius_normalised: float
-    map_x_px: FloatImage
-    map_y_px: FloatImage
+    remap_x_px: FloatImage
+    remap_y_px: FloatImage
     reduced_image_size_px: tuple[int, int]
     is_in_image: NDArray[np.bool_]
 
@@ -390,7 +390,7 @@ def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
     rays = np.clip(
         np.nan_to_num(rays, nan=0.0), -_MAX_VIEW_RADIUS_NORMALISED, _MAX_VIEW_RADIUS_NORMALISED
     )
-    reach = _VALID_LENS_TO_IMAGE_RADIUS_RATIO * float(np.hypot(*rays.T).max())
+    reach = _VALID_LENS_RADIUS_TO_IMAGE_RADIUS_RATIO * float(np.hypot(*rays.T).max())
     step = w / (_LATTICE_COLUMNS * float(camera.K[0, 0]))
     nodes = np.maximum(np.ceil(np.ptp(rays, axis=0) / step).astype(int), 1)
     fine = [
@@ -421,8 +421,8 @@ def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
         first_node_normalised=rays.min(axis=0) + step / 2.0,
         node_spacing_normalised=step,
         valid_radius_normalised=reach,
-        map_x_px=np.ascontiguousarray(reduced[:, 0].reshape(flat)),
-        map_y_px=np.ascontiguousarray(reduced[:, 1].reshape(flat)),
+        remap_x_px=np.ascontiguousarray(reduced[:, 0].reshape(flat)),
+        remap_y_px=np.ascontiguousarray(reduced[:, 1].reshape(flat)),
         reduced_image_size_px=size,
         is_in_image=inside.reshape(shape).all(axis=(1, 3)),
     )
@@ -447,11 +447,11 @@ def _sample_image_at_nodes(
     small = cv2.resize(image, lattice.reduced_image_size_px, interpolation=cv2.INTER_AREA).astype(
         np.float32
     )
-    fine_image = cv2.remap(small, lattice.map_x_px, lattice.map_y_px, cv2.INTER_LINEAR)
-    return _downsample(np.asarray(fine_image, np.float32))
+    fine_image = cv2.remap(small, lattice.remap_x_px, lattice.remap_y_px, cv2.INTER_LINEAR)
+    return _average_samples_per_node(np.asarray(fine_image, np.float32))
 
 
-def _downsample(fine_image: FloatImage) -> FloatImage:
+def _average_samples_per_node(fine_image: FloatImage) -> FloatImage:
     rows, columns = (n // _SAMPLES_PER_LATTICE_NODE_AND_AXIS for n in fine_image.shape)
     return np.asarray(
         cv2.resize(fine_image, (columns, rows), interpolation=cv2.INTER_AREA), np.float32
@@ -492,7 +492,7 @@ def render_drawing(
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=1.0,
     )
-    return _downsample(np.asarray(fine, np.float32))
+    return _average_samples_per_node(np.asarray(fine, np.float32))
 
 
 class DrawingMatch(NamedTuple):
@@ -516,7 +516,7 @@ def correlate_drawing(
     nodes on the paper. `H_normalised_drawing` (3, 3) maps the drawing's coordinates, in half sides
     of the large marker from the target's centre, to normalised image coordinates. The brightness
     and the contrast of the drawing, each with a gradient across the image, are first fitted to the
-    image. Both results are 0 if fewer than `_MIN_VISIBLE_PAPER_NODES` nodes are visible."""
+    image. Both results are 0 if fewer than `_MIN_VISIBLE_NODES_ON_PAPER` nodes are visible."""
     lattice = coarse_image.lattice
     rows, columns = np.nonzero(coarse_image.is_visible)
     at = lattice.first_node_normalised + lattice.node_spacing_normalised * np.stack(
@@ -528,7 +528,7 @@ def correlate_drawing(
         ).max(axis=1)
         < PAPER_REACH_LARGE_MARKER_HALF_SIDES
     )
-    if np.count_nonzero(on) < _MIN_VISIBLE_PAPER_NODES:
+    if np.count_nonzero(on) < _MIN_VISIBLE_NODES_ON_PAPER:
         return DrawingMatch(0.0, 0.0)
     white = render_drawing(H_normalised_drawing, texture, lattice)[rows[on], columns[on]].astype(
         np.float64
@@ -537,7 +537,7 @@ def correlate_drawing(
     x, y = (at[on] - at[on].mean(axis=0)).T
     A = np.stack([np.ones_like(x), x, y, white, white * x, white * y], axis=1)
     light = np.linalg.solve(A.T @ A + 1e-6 * np.eye(6), A.T @ grey)
-    return DrawingMatch(fit_correlation(grey, grey - A @ light), float(light[3]))
+    return DrawingMatch(correlation_from_residual(grey, grey - A @ light), float(light[3]))
 
 
 # --- The drawing of the whole target: its edges between black and white, and its texture ---
@@ -546,7 +546,7 @@ def correlate_drawing(
 # Distance from the target's centre up to which there is certainly paper.
 PAPER_REACH_LARGE_MARKER_HALF_SIDES = 1.25
 # Points along the side of a cell of the large and of the small marker.
-_POINTS_PER_LARGE_CELL, _POINTS_PER_SMALL_CELL = 24, 6
+_POINTS_PER_LARGE_MARKER_CELL_SIDE, _POINTS_PER_SMALL_MARKER_CELL_SIDE = 24, 6
 # Margin at both ends of a cell's side, where the corner of the next cell blurs the edge.
 _EDGE_END_MARGIN_CELLS = 0.15
 # Distance from the centre, in half sides of the small marker, within which it hides the large one.
@@ -598,7 +598,9 @@ def make_outline(
     hidden = _SMALL_MARKER_OCCLUSION_REACH_HALF_SIDES * drawing.small_to_large_side_ratio
     edges = [
         edge
-        for edge in _iterate_cell_edges(drawing.cell_whiteness, 1.0, _POINTS_PER_LARGE_CELL)
+        for edge in _iterate_cell_edges(
+            drawing.cell_whiteness, 1.0, _POINTS_PER_LARGE_MARKER_CELL_SIDE
+        )
         if np.abs(edge.points_half_sides).max(axis=1).min() > hidden
     ]
     large = len(edges)
@@ -606,7 +608,7 @@ def make_outline(
         edges += _iterate_cell_edges(
             drawing.small_marker_cell_whiteness,
             drawing.small_to_large_side_ratio,
-            _POINTS_PER_SMALL_CELL,
+            _POINTS_PER_SMALL_MARKER_CELL_SIDE,
         )
     at, normals, names, cells = zip(*edges, strict=True)
     numbers = {name: k for k, name in enumerate(names)}
@@ -695,33 +697,33 @@ def _iterate_cell_edges(
 # Half lengths of the profiles in each iteration. An ascent blurs edges near the image's border by
 # several pixels.
 _PROFILE_HALF_LENGTH_PER_ITERATION_PX = (14.0, 10.0, 8.0, 8.0, 8.0, 8.0)
-_PROFILE_REACH_CELLS, _MIN_PROFILE_REACH_PX = 0.4, 3.0
+_MAX_PROFILE_HALF_LENGTH_CELLS, _MIN_PROFILE_HALF_LENGTH_PX = 0.4, 3.0
 # A step below the first limit ends the fit. If the last step exceeds the second limit, the fit has
 # failed.
-_CONVERGED_FIT_PX, _MAX_CONVERGENCE_ERROR_PX = 0.02, 0.5
+_MAX_CONVERGED_STEP_PX, _MAX_LAST_STEP_PX = 0.02, 0.5
 # Minimum contrast of an edge: in grey levels, and as a fraction of the median contrast.
-_MIN_EDGE_CONTRAST, _MIN_CONTRAST_FRACTION = 8.0, 0.35
+_MIN_EDGE_CONTRAST_GREY, _MIN_EDGE_TO_MEDIAN_CONTRAST_RATIO = 8.0, 0.35
 _MIN_EDGE_POINTS = 24
 _TUKEY_CUTOFF_SIGMAS, _MIN_TUKEY_SCALE_PX = 3.5, 0.15
 # Robust weights make the squared residuals smaller; this factor compensates for that.
-_ROBUST_VARIANCE_FACTOR = 1.3
+_TUKEY_VARIANCE_CORRECTION_FACTOR = 1.3
 # Error of a whole line, due to the lens and the illumination.
 _COMMON_LINE_OFFSET_SIGMA_PX = 0.02
 # Standard deviations of the predicted pose.
-_TILT_SIGMA_RAD, _ROTATION_SIGMA_RAD, _TRANSLATION_SIGMA = (
+_TILT_PRIOR_SIGMA_RAD, _ROTATION_PRIOR_SIGMA_RAD, _TRANSLATION_PRIOR_SIGMA_HALF_SIDES = (
     math.radians(2.0),
     math.radians(20.0),
     1.0,
 )
-_EDGE_SHIFT_SIGMA_PX = 0.15  # standard deviation of the growth of white over black
+_EDGE_SHIFT_PRIOR_SIGMA_PX = 0.15  # standard deviation of the growth of white over black
 _POSE_PRIOR_INFORMATION_DIAGONAL: Array = (
     np.array(
         [
-            _TILT_SIGMA_RAD,
-            _TILT_SIGMA_RAD,
-            _ROTATION_SIGMA_RAD,
-            *3 * [_TRANSLATION_SIGMA],
-            _EDGE_SHIFT_SIGMA_PX,
+            _TILT_PRIOR_SIGMA_RAD,
+            _TILT_PRIOR_SIGMA_RAD,
+            _ROTATION_PRIOR_SIGMA_RAD,
+            *3 * [_TRANSLATION_PRIOR_SIGMA_HALF_SIDES],
+            _EDGE_SHIFT_PRIOR_SIGMA_PX,
         ]
     )
     ** -2.0
@@ -799,14 +801,14 @@ class _GaussNewtonStep(NamedTuple):
     Attributes:
         pose_and_edge_shift_change: change (7,) of these unknowns.
         inverse_normal_matrix: inverse (7, 7) of the normal matrix, which includes the prior.
-        weight: robust weight (n,) of each edge point, 0 to 1; 0 for outliers and where no
+        point_weight: robust weight (n,) of each edge point, 0 to 1; 0 for outliers and where no
             edge was found.
         point_variance_px2: variance of the distance of one edge point from its edge.
     """
 
     pose_and_edge_shift_change: Array
     inverse_normal_matrix: Array
-    weight: Array
+    point_weight: Array
     point_variance_px2: float
 
 
@@ -831,13 +833,13 @@ def fit_pose(
         math.inf,
     )
     for max_profile_half_length_px in _PROFILE_HALF_LENGTH_PER_ITERATION_PX:
-        edge_points = _edge_points_in_view(
+        edge_points = _project_edge_points_in_view(
             pose, outline, max_profile_half_length_px, image.shape, camera, hidden_mask_u8
         )
         if len(edge_points.outline_point_index) < _MIN_EDGE_POINTS:
             return None
         reach_cells_px = (
-            _PROFILE_REACH_CELLS
+            _MAX_PROFILE_HALF_LENGTH_CELLS
             * outline.adjacent_cell_width_half_sides[edge_points.outline_point_index]
             * edge_points.px_per_half_side
         )
@@ -860,10 +862,10 @@ def fit_pose(
         pose = RigidPose(turn @ pose.R_cam_drawing, pose.t_cam_drawing_half_sides + step[3:])
         pose_and_edge_shift_change_from_start[:6] += step
         moved_px = float(np.abs(edge_points.normal_motion_jacobian[:, :6] @ step).max())
-        if moved_px < _CONVERGED_FIT_PX:
+        if moved_px < _MAX_CONVERGED_STEP_PX:
             break
     if fit_step is None or not (
-        moved_px <= _MAX_CONVERGENCE_ERROR_PX and pose.t_cam_drawing_half_sides[2] > 0.0
+        moved_px <= _MAX_LAST_STEP_PX and pose.t_cam_drawing_half_sides[2] > 0.0
     ):  # also for NaN
         return None
     return _make_pose_fit(pose, fit_step, edge_points, outline)
@@ -879,7 +881,7 @@ def predict_fit_accuracy(
     Only the covariance and the point counts are meaningful. The covariance is optimistic because an
     RMS residual of only 0.03 px is assumed.
     """
-    edge_points = _edge_points_in_view(
+    edge_points = _project_edge_points_in_view(
         pose, outline, _PROFILE_HALF_LENGTH_PER_ITERATION_PX[0], camera.size_px[::-1], camera, None
     )
     n = len(edge_points.outline_point_index)
@@ -891,15 +893,15 @@ def predict_fit_accuracy(
     return None if fit_step is None else _make_pose_fit(pose, fit_step, edge_points, outline)
 
 
-def _edge_points_in_view(
+def _project_edge_points_in_view(
     pose: RigidPose,
     outline: TargetOutline,
     max_profile_half_length_px: float,
-    shape: tuple[int, ...],
+    image_shape: tuple[int, ...],
     camera: CameraModel,
     hidden_mask_u8: NDArray[np.uint8] | None,
 ) -> _EdgePoints:
-    h, w = shape[:2]
+    h, w = image_shape[:2]
     X = (
         np.column_stack([outline.points_half_sides, np.zeros(len(outline.points_half_sides))])
         @ pose.R_cam_drawing.T
@@ -962,7 +964,7 @@ def _measure_edge_offsets(
     `profile_half_lengths_px` (n,) to both sides of the expected position. It counts as found if its
     contrast is high enough.
     """
-    profile_half_lengths_px = np.maximum(profile_half_lengths_px, _MIN_PROFILE_REACH_PX)
+    profile_half_lengths_px = np.maximum(profile_half_lengths_px, _MIN_PROFILE_HALF_LENGTH_PX)
     grey = sample_profiles(
         image,
         edge_points.points_px[:, None],
@@ -974,7 +976,9 @@ def _measure_edge_offsets(
     mass = gradient * np.exp(-0.5 * (u / (0.5 * profile_half_lengths_px[:, None])) ** 2)
     total = mass.sum(axis=1)
     contrast = grey[:, -1].astype(np.float64) - grey[:, 0]
-    least = max(_MIN_EDGE_CONTRAST, _MIN_CONTRAST_FRACTION * float(np.median(contrast)))
+    least = max(
+        _MIN_EDGE_CONTRAST_GREY, _MIN_EDGE_TO_MEDIAN_CONTRAST_RATIO * float(np.median(contrast))
+    )
     is_edge_found = (contrast > least) & (total > 0.25 * least)
     edge_offset_to_white_px = (mass * u).sum(axis=1) / np.where(is_edge_found, total, 1.0)
     return np.clip(
@@ -1004,7 +1008,7 @@ def _solve_gauss_newton_step(
         mass = float(weight.sum())
         if mass < 0.5 * _MIN_EDGE_POINTS:
             return None
-        variance = max(_ROBUST_VARIANCE_FACTOR * float(weight @ error**2) / mass, 1e-3)
+        variance = max(_TUKEY_VARIANCE_CORRECTION_FACTOR * float(weight @ error**2) / mass, 1e-3)
         N = (J * weight[:, None]).T @ J / variance + np.diag(_POSE_PRIOR_INFORMATION_DIAGONAL)
         inverse = np.asarray(np.linalg.inv(N), np.float64)
         step = inverse @ (

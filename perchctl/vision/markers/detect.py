@@ -23,7 +23,11 @@ from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig
 from perchctl.values import replace
 from perchctl.vision.fields import interpolate_fields, interpolated_field_edge_sigma_px
-from perchctl.vision.markers.blurred import align_marker, find_blurred, find_expected_blurred
+from perchctl.vision.markers.blurred import (
+    align_marker,
+    find_blurred_marker,
+    find_expected_blurred_marker,
+)
 from perchctl.vision.markers.corners import (
     CORNER_SIGMA_FROM_OTHER_MARKER_PX,
     RefinedCorners,
@@ -37,7 +41,7 @@ from perchctl.vision.markers.cut import (
     MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S,
     can_complete_marker_be_in_view,
     fit_truncated_markers,
-    is_target_truncated,
+    is_target_possibly_truncated,
 )
 from perchctl.vision.markers.detector import (
     DetectorInput,
@@ -60,7 +64,12 @@ from perchctl.vision.markers.pattern import (
     has_mostly_matching_cells,
     is_correlated_with_pattern,
 )
-from perchctl.vision.markers.search import FoundMarkers, SearchMode, search, search_half_size_image
+from perchctl.vision.markers.search import (
+    FoundMarkers,
+    SearchMode,
+    search_for_markers,
+    search_half_size_image,
+)
 from perchctl.vision.target_selection import MarkerToOwnTargetDistanceFunction
 from perchctl.vision.types import (
     MARKERS,
@@ -92,9 +101,9 @@ class DetectionPrior:
         expected_corners_both_markers_px: the predicted corners of both markers, each (4, 2) px; a
             missing marker is derived from the other one. Empty if no target is expected.
         search_mode: the kinds of search for this frame.
-        frame_counter_for_initial_blur: counter whose parity selects a small (even) or a large
+        initial_blur_alternation_counter: counter whose parity selects a small (even) or a large
             (odd) initial blur for the fits to blurred markers; None to try both (see
-            `find_expected_blurred`).
+            `find_expected_blurred_marker`).
         was_target_seen_recently: True if a marker was found at most
             `MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S` before this frame; always False if edge fits
             are disabled.
@@ -111,7 +120,7 @@ class DetectionPrior:
     expected_corners_px: Mapping[MarkerName, Array]
     expected_corners_both_markers_px: Mapping[MarkerName, Array]
     search_mode: SearchMode
-    frame_counter_for_initial_blur: int | None
+    initial_blur_alternation_counter: int | None
     was_target_seen_recently: bool
     was_target_truncated: bool
     previous_edge_shift: EdgeShift | None
@@ -217,11 +226,11 @@ def _needs_photometric_fit(
 ) -> bool:
     patterns = detector_input.setup.patterns
     return _has_half_size_search_found_nothing(detector_input, prior, earlier_results) and not any(
-        is_line_fit_sufficient(r, patterns[name]) for name, r in earlier_results.corners.items()
+        is_line_fit_accurate(r, patterns[name]) for name, r in earlier_results.corners.items()
     )
 
 
-def _fit_drawing(
+def _run_photometric_fit(
     detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> CornerResults:
     return replace(
@@ -234,7 +243,7 @@ def _can_target_be_truncated(
 ) -> bool:
     if earlier_results.corners or not prior.was_target_seen_recently:
         return False
-    return is_target_truncated(
+    return is_target_possibly_truncated(
         prior.expected_corners_both_markers_px,
         detector_input.image.shape,
         detector_input.hidden_mask,
@@ -264,10 +273,10 @@ def _should_search(
     return _is_marker_missing(detector_input, earlier_results.corners, prior.expected_corners_px)
 
 
-def _search(
+def _run_search(
     detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> CornerResults:
-    searched = search(
+    searched = search_for_markers(
         detector_input,
         prior.expected_corners_px,
         prior.search_mode,
@@ -285,16 +294,16 @@ def _can_target_be_blurred(
     return not earlier_results.corners and allowed and detector_input.setup.is_line_fit_enabled
 
 
-def _search_blurred(
+def _run_blurred_search(
     detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> CornerResults:
     bare = replace(detector_input, hidden_mask=None)
     if prior.expected_corners_px:
-        found_corners = find_expected_blurred(
-            bare, prior.expected_corners_px, prior.frame_counter_for_initial_blur
+        found_corners = find_expected_blurred_marker(
+            bare, prior.expected_corners_px, prior.initial_blur_alternation_counter
         )
     else:
-        found_corners = find_blurred(bare)
+        found_corners = find_blurred_marker(bare)
     return replace(earlier_results, corners=refine_photometrically(bare, found_corners))
 
 
@@ -335,7 +344,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         run_condition_text="the edge fit was tried, and no marker's edges suffice: its cells are "
         "smaller than 6 px or than six times the blur; not if the half-size search found one",
         should_run=_needs_photometric_fit,
-        find=_fit_drawing,
+        find=_run_photometric_fit,
     ),
     CornerMethod(
         name="Cut-view fit",
@@ -355,7 +364,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         "or an expected marker with sides above 13 px is missing; after the target was "
         "lost, in three of four images",
         should_run=_should_search,
-        find=_search,
+        find=_run_search,
     ),
     CornerMethod(
         name="Blurred search",
@@ -363,7 +372,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         cost_text="5 to 10 ms",
         run_condition_text="nothing was found; after the target was lost, in one of four images",
         should_run=_can_target_be_blurred,
-        find=_search_blurred,
+        find=_run_blurred_search,
     ),
 )
 """The corner methods in the order in which they are tried on each image. With
@@ -410,9 +419,11 @@ def detect_markers(
         measure_marker_to_own_target_distance_m,
     )
     if frame.picture_kind == "woven":
-        first, second = (_detect(each, setup, camera, prior) for each in interpolate_fields(frame))
+        first, second = (
+            _detect_with_prior(each, setup, camera, prior) for each in interpolate_fields(frame)
+        )
         return add_marker_flow(average_field_detections(first, second), previous)
-    return add_marker_flow(_detect(frame, setup, camera, prior), previous)
+    return add_marker_flow(_detect_with_prior(frame, setup, camera, prior), previous)
 
 
 def make_detection_prior(
@@ -437,9 +448,9 @@ def make_detection_prior(
     search_mode = _choose_search_mode(
         frames_without_markers, bool(expected_corners_px), setup.is_line_fit_enabled
     )
-    frame_counter_for_initial_blur = None
+    initial_blur_alternation_counter = None
     if frames_without_markers is not None and search_mode in ("near_expected", "expected_fits"):
-        frame_counter_for_initial_blur = (frames_without_markers + 2) // 4
+        initial_blur_alternation_counter = (frames_without_markers + 2) // 4
     # A part of the target is only recognised at a recently measured position.
     last = {} if previous is None else {d.marker: d.corners_px for d in previous.markers}
     was_recent = (
@@ -461,7 +472,7 @@ def make_detection_prior(
             expected_corners_px, setup.small_to_large_side_ratio, camera
         ),
         search_mode=search_mode,
-        frame_counter_for_initial_blur=frame_counter_for_initial_blur,
+        initial_blur_alternation_counter=initial_blur_alternation_counter,
         was_target_seen_recently=was_recent,
         was_target_truncated=was_recent
         and not can_complete_marker_be_in_view(last, frame.image.shape),
@@ -470,7 +481,7 @@ def make_detection_prior(
     )
 
 
-def _detect(
+def _detect_with_prior(
     frame: Frame, setup: DetectorSetup, camera: CameraModel, prior: DetectionPrior
 ) -> Detections:
     hidden_mask = make_hidden_mask(frame, setup.static_hidden_mask)
@@ -535,7 +546,7 @@ def _refine_found_markers(detector_input: DetectorInput, found: FoundMarkers) ->
     edges are not accurate enough."""
     image, setup = detector_input.image, detector_input.setup
     raw = {name: found.corners_px[name] for name in MARKERS if name in found.corners_px}
-    lines = fit_lines(detector_input, raw) if setup.is_line_fit_enabled else {}
+    lines = fit_side_lines(detector_input, raw) if setup.is_line_fit_enabled else {}
     found_corners = {
         name: lines.get(name)
         or refine_subpix(image, corners, setup.patterns[name].cells_along_border.cells_per_side)
@@ -646,7 +657,7 @@ _MIN_CELL_FOR_ACCURATE_LINE_FIT_PX = 6.0
 _MIN_CELL_TO_BLUR_RATIO_FOR_ACCURATE_LINE_FIT = 6.0
 _MAX_ALIGNMENT_MOTION_SIDES = 0.3
 # A marker that is located from the other marker may have a larger standard deviation.
-_MAX_SINGLE_MARKER_SIGMA_SIDES, _MAX_SECOND_MARKER_SIGMA_SIDES = 0.06, 0.12
+_MAX_SINGLE_MARKER_CORNER_SIGMA_SIDES, _MAX_SECOND_MARKER_CORNER_SIGMA_SIDES = 0.06, 0.12
 _DEFAULT_INITIAL_BLUR_SIGMA_PX = 1.5
 _SAMPLING_BLUR_SIGMA_PX = 0.37
 """Standard deviation, px, that pixels and interpolation add to the measured blur of a marker's
@@ -654,7 +665,7 @@ sides, but not to the blur of its drawing."""
 _OTHER_MARKER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
-def is_line_fit_sufficient(corners: RefinedCorners, pattern: MarkerPattern) -> bool:
+def is_line_fit_accurate(corners: RefinedCorners, pattern: MarkerPattern) -> bool:
     """True if the corners come from an edge fit that is as accurate as a photometric fit. This
     requires cells that are at least 6 px wide, and at least 6 times as wide as the blur."""
     cell_size_px = mean_side_px(corners.corners_px) / pattern.cells_along_border.cells_per_side
@@ -683,7 +694,7 @@ def refine_photometrically(
         if large is not None:
             better["large"] = large
     for name in MARKERS:
-        start = _initial_corners_px(detector_input, name, better)
+        start = _photometric_start_corners_px(detector_input, name, better)
         if (
             start is None
             or not is_inside_image(start, image.shape)
@@ -692,9 +703,11 @@ def refine_photometrically(
             continue
         is_single = _OTHER_MARKER[name] not in better
         max_corner_sigma_sides = (
-            _MAX_SINGLE_MARKER_SIGMA_SIDES if is_single else _MAX_SECOND_MARKER_SIGMA_SIDES
+            _MAX_SINGLE_MARKER_CORNER_SIGMA_SIDES
+            if is_single
+            else _MAX_SECOND_MARKER_CORNER_SIGMA_SIDES
         )
-        blur_px = _initial_blur_sigma_px(better.get(name))
+        blur_px = _photometric_initial_blur_sigma_px(better.get(name))
         exact = align_marker(
             detector_input,
             name,
@@ -713,7 +726,7 @@ def refine_photometrically(
     return better
 
 
-def _initial_blur_sigma_px(corners: RefinedCorners | None) -> float:
+def _photometric_initial_blur_sigma_px(corners: RefinedCorners | None) -> float:
     """Return the standard deviation of the blur, px, at which a photometric fit starts. If lines
     were fitted to the sides in `corners`, it is the blur of the blurriest side without the blur due
     to sampling (its variance is subtracted). Otherwise, or if `corners` is None, it is
@@ -730,7 +743,7 @@ def _initial_blur_sigma_px(corners: RefinedCorners | None) -> float:
     )
 
 
-def _initial_corners_px(
+def _photometric_start_corners_px(
     detector_input: DetectorInput, name: MarkerName, found_corners: _FoundCorners
 ) -> Array | None:
     this, other = found_corners.get(name), found_corners.get(_OTHER_MARKER[name])
@@ -739,7 +752,7 @@ def _initial_corners_px(
             # Whatever hides a part of the marker would also disturb the photometric fit.
             return None
         # Small cells only matter if no larger ones were measured.
-        enough = is_line_fit_sufficient(this, detector_input.setup.patterns[name])
+        enough = is_line_fit_accurate(this, detector_input.setup.patterns[name])
         enough = enough or (name == "small" and other is not None)
         return None if this.are_corners_fitted and enough else this.corners_px
     if name == "small" and other is not None and other.are_corners_fitted:
@@ -751,10 +764,10 @@ def _initial_corners_px(
 
 
 _MIN_CELL_FOR_LINE_FIT_PX = 2.5
-_MAX_CENTRE_OFFSET_SMALL_MARKER_SIDES = 0.12
+_MAX_LARGE_TO_SMALL_OFFSET_SMALL_SIDES = 0.12
 
 
-def fit_lines(
+def fit_side_lines(
     detector_input: DetectorInput,
     start_corners_px: Mapping[MarkerName, Array],
     known_edge_shift: EdgeShift | None = None,
@@ -804,7 +817,9 @@ def refine_expected_markers(
     }
     return {
         name: found
-        for name, found in fit_lines(detector_input, start_corners_px, known_edge_shift).items()
+        for name, found in fit_side_lines(
+            detector_input, start_corners_px, known_edge_shift
+        ).items()
         if is_fully_visible(detector_input, found)
         and has_matching_cells(image, found.corners_px, patterns[name])
     }
@@ -864,15 +879,15 @@ def find_large_marker_around_small(
         centre = detector_input.derive_corners_from_other_marker_px(large.corners_px, "small")
         off_px = float(np.abs(centre - small.corners_px).max())
         return off_px <= max(
-            _MAX_CENTRE_OFFSET_SMALL_MARKER_SIDES * mean_side_px(small.corners_px), 1.0
+            _MAX_LARGE_TO_SMALL_OFFSET_SMALL_SIDES * mean_side_px(small.corners_px), 1.0
         )
 
     if is_inside_image(start, image.shape, IMAGE_BORDER_MARGIN_PX):
         # The small marker only yields an approximate position, so the fit is repeated from its
         # first result.
-        found = fit_lines(detector_input, {"large": start}).get("large")
+        found = fit_side_lines(detector_input, {"large": start}).get("large")
         if found is not None:
-            found = fit_lines(detector_input, {"large": found.corners_px}).get("large")
+            found = fit_side_lines(detector_input, {"large": found.corners_px}).get("large")
         if found is not None:
             start = found.corners_px
             good = is_fully_visible(detector_input, found) and is_centred(found)

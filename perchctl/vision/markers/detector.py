@@ -31,18 +31,18 @@ MIRRORED_MARKER_ID = 1
 # The error of an edge is small because the errors of its hundreds of printed dots average out.
 _PRINT_EDGE_SIGMA_M = 1e-6
 _MIN_MARKER_PERIMETER_PX = 19.2  # OpenCV's default, 0.03 times the image size, for 640 px
-_LOOSE_MIN_PERIMETER_RATE = 0.05
-_LOOSE_POLYGON_ACCURACY_RATE = 0.1
+_QUAD_DETECTOR_MIN_PERIMETER_RATE = 0.05
+_QUAD_DETECTOR_POLYGON_ACCURACY_RATE = 0.1
 
 
 ThresholdWindowRange = tuple[int, int]
 """Smallest and largest window of the adaptive threshold, px; OpenCV tries windows in steps of
 10."""
-OPENCV_THRESHOLD_WINDOWS_PX: ThresholdWindowRange = (3, 23)
+OPENCV_DEFAULT_THRESHOLD_WINDOWS_PX: ThresholdWindowRange = (3, 23)
 """OpenCV's default windows."""
 # A single window is sufficient if both markers were seen in the previous frame.
 QUICK_THRESHOLD_WINDOWS_PX: ThresholdWindowRange = (13, 13)
-_LOOSE_THRESHOLD_WINDOWS_PX: ThresholdWindowRange = (15, 35)
+_QUAD_DETECTOR_THRESHOLD_WINDOWS_PX: ThresholdWindowRange = (15, 35)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +74,8 @@ def make_detector_setup(
     small_to_large_side_ratio = target.small.side_m / target.large.side_m
     return DetectorSetup(
         large_and_small_aruco_dictionaries=(
-            _make_dictionary(large_bits, config.correction_bits_large),
-            _make_dictionary(small_bits, config.correction_bits_small),
+            _make_aruco_dictionary(large_bits, config.correction_bits_large),
+            _make_aruco_dictionary(small_bits, config.correction_bits_small),
         ),
         patterns={
             "large": make_marker_pattern(
@@ -119,18 +119,18 @@ def make_aruco_detector(
 def make_quad_detector(setup: DetectorSetup) -> Any:
     """Return OpenCV's marker detector, configured to find nearly any quadrilateral. It also
     returns the quadrilaterals whose bits it cannot read. The caller compares them with blurred
-    markers (`find_blurred`)."""
+    markers (`find_blurred_marker`)."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = 0
-    parameters.polygonalApproxAccuracyRate = _LOOSE_POLYGON_ACCURACY_RATE
-    least_px, most_px = _LOOSE_THRESHOLD_WINDOWS_PX
+    parameters.polygonalApproxAccuracyRate = _QUAD_DETECTOR_POLYGON_ACCURACY_RATE
+    least_px, most_px = _QUAD_DETECTOR_THRESHOLD_WINDOWS_PX
     parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = least_px, most_px
     parameters.adaptiveThreshWinSizeStep = most_px - least_px
-    parameters.minMarkerPerimeterRate = _LOOSE_MIN_PERIMETER_RATE
+    parameters.minMarkerPerimeterRate = _QUAD_DETECTOR_MIN_PERIMETER_RATE
     return cv2.aruco.ArucoDetector(list(setup.large_and_small_aruco_dictionaries), parameters)
 
 
-def _make_dictionary(bits: NDArray[np.uint8], max_correction_bits: int) -> Any:
+def _make_aruco_dictionary(bits: NDArray[np.uint8], max_correction_bits: int) -> Any:
     patterns, mirror = [bits], np.ascontiguousarray(bits[:, ::-1])
     distance = min(int((np.rot90(mirror, turn) != bits).sum()) for turn in range(4))
     if distance > 2 * max_correction_bits + 1:
@@ -153,7 +153,7 @@ WHITE_BORDER_REACH_HALF_SIDES = 1.25
 of the marker's sides."""
 _HIDDEN_MASK_DILATION_ROWS = 7  # A covered row contributes to this number of a field's image rows.
 # Factor by which the image is reduced, and standard deviation of the fill in the reduced image.
-_FILL_REDUCTION, _FILL_SIGMA = 8, 2.0
+_FILL_REDUCTION_FACTOR, _FILL_SIGMA_REDUCED_PX = 8, 2.0
 _MEAN_GREY_WEIGHT_IN_FILL = 1e-4
 
 
@@ -176,11 +176,11 @@ def fill_hidden_pixels(image: NDArray[np.uint8], hidden_mask: HiddenMask) -> NDA
     smooth interpolation of their surroundings."""
     h, w = image.shape
     free = (~hidden_mask).astype(np.float32)
-    size = (max(w // _FILL_REDUCTION, 1), max(h // _FILL_REDUCTION, 1))
+    size = (max(w // _FILL_REDUCTION_FACTOR, 1), max(h // _FILL_REDUCTION_FACTOR, 1))
 
     def around(values: NDArray[np.float32]) -> NDArray[np.float32]:
         reduced = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
-        return np.asarray(cv2.GaussianBlur(reduced, (0, 0), _FILL_SIGMA), np.float32)
+        return np.asarray(cv2.GaussianBlur(reduced, (0, 0), _FILL_SIGMA_REDUCED_PX), np.float32)
 
     mean = cv2.mean(image, (~hidden_mask).astype(np.uint8))[0]
     grey = (around(image * free) + _MEAN_GREY_WEIGHT_IN_FILL * mean) / (

@@ -53,7 +53,7 @@ from perchctl.vision.markers.corners import (
     homography_from_centred_square,
     homography_to_centred_square,
     side_lengths_px,
-    signed_double_area,
+    signed_double_area_clockwise,
 )
 from perchctl.vision.markers.pattern import CellsAlongBorder
 from perchctl.vision.types import CameraModel, EdgeShift
@@ -62,14 +62,14 @@ from perchctl.vision.types import CameraModel, EdgeShift
 
 
 PROFILES_PER_SIDE = 24
-SAMPLES_PER_PROFILE = 16  # number of gradient samples; there is one more grey sample
+GRADIENT_SAMPLES_PER_PROFILE = 16  # number of gradient samples; there is one more grey sample
 Floats = NDArray[np.float32]
 
 # Positions of the profiles along a side, from -1 to 1 between the margins at its ends.
 PROFILE_POSITIONS_ALONG_SIDE: Array = np.linspace(-1.0, 1.0, PROFILES_PER_SIDE)
-_SAMPLE_POSITIONS_HALF_LENGTHS: Floats = np.linspace(-1.0, 1.0, SAMPLES_PER_PROFILE + 1).astype(
-    np.float32
-)
+_SAMPLE_POSITIONS_HALF_LENGTHS: Floats = np.linspace(
+    -1.0, 1.0, GRADIENT_SAMPLES_PER_PROFILE + 1
+).astype(np.float32)
 _PROFILE_SAMPLING_MATRIX: Floats = np.stack(
     [np.ones_like(_SAMPLE_POSITIONS_HALF_LENGTHS), _SAMPLE_POSITIONS_HALF_LENGTHS]
 )
@@ -78,12 +78,14 @@ GRADIENT_POSITIONS_HALF_LENGTHS: Floats = (
     _SAMPLE_POSITIONS_HALF_LENGTHS[1:] + _SAMPLE_POSITIONS_HALF_LENGTHS[:-1]
 ) * np.float32(0.5)
 # The two matrices evaluate the polynomial through the nodes, and its slope, at the profiles.
-_NODE_POSITIONS_ALONG_SIDE: Array = np.array([-1.0, -0.7, 0.0, 0.7, 1.0])
-_INVERSE_VANDERMONDE: Array = np.linalg.inv(_NODE_POSITIONS_ALONG_SIDE[:, None] ** np.arange(5.0))
-_NODE_TO_PROFILE_VALUES_MATRIX: Array = (
+_INTERPOLATION_NODES_ALONG_SIDE: Array = np.array([-1.0, -0.7, 0.0, 0.7, 1.0])
+_INVERSE_VANDERMONDE: Array = np.linalg.inv(
+    _INTERPOLATION_NODES_ALONG_SIDE[:, None] ** np.arange(5.0)
+)
+_PROFILE_VALUE_INTERPOLATION_MATRIX: Array = (
     PROFILE_POSITIONS_ALONG_SIDE[:, None] ** np.arange(5)
 ) @ _INVERSE_VANDERMONDE
-_NODE_TO_PROFILE_SLOPES_MATRIX: Array = (
+_PROFILE_SLOPE_INTERPOLATION_MATRIX: Array = (
     np.arange(1, 5) * PROFILE_POSITIONS_ALONG_SIDE[:, None] ** np.arange(4)
 ) @ _INVERSE_VANDERMONDE[1:]
 
@@ -99,7 +101,7 @@ def profile_fractions_along_side(lengths_px: Array) -> Array:
     return np.asarray(margin + (0.5 - margin) * (1.0 + PROFILE_POSITIONS_ALONG_SIDE))
 
 
-def make_side_profiles(
+def make_profile_centres_and_normals(
     side_starts_normalised: Array,
     side_ends_normalised: Array,
     fractions_along_side: Array,
@@ -115,15 +117,17 @@ def make_side_profiles(
     `profile_fractions_along_side`. The image of a side through the lens is a smooth curve, so it is
     computed at five points and interpolated."""
     first, last = fractions_along_side[:, :1], fractions_along_side[:, -1:]
-    at = (0.5 * (first + last) + (0.5 * (last - first)) * _NODE_POSITIONS_ALONG_SIDE)[..., None]
+    at = (0.5 * (first + last) + (0.5 * (last - first)) * _INTERPOLATION_NODES_ALONG_SIDE)[
+        ..., None
+    ]
     points = (
         side_starts_normalised[:, None]
         + at * (side_ends_normalised - side_starts_normalised)[:, None]
     )
     nodes = distort_to_px(points.reshape(-1, 2), camera).reshape(points.shape)
-    origin = np.matmul(_NODE_TO_PROFILE_VALUES_MATRIX, nodes)
+    origin = np.matmul(_PROFILE_VALUE_INTERPOLATION_MATRIX, nodes)
     # With complex numbers x + iy, a rotation by 90 degrees is a single multiplication.
-    tangent = np.matmul(_NODE_TO_PROFILE_SLOPES_MATRIX, nodes).view(np.complex128)
+    tangent = np.matmul(_PROFILE_SLOPE_INTERPOLATION_MATRIX, nodes).view(np.complex128)
     normal = tangent * (_ROTATE_90_LEFT / np.maximum(np.abs(tangent), 1e-12))
     return origin, normal.view(np.float64)
 
@@ -169,10 +173,12 @@ def sample_profiles(
         casting="same_kind",
     )
     x, y = (lines.reshape(-1, 2) @ _PROFILE_SAMPLING_MATRIX).reshape(
-        2, rows, n * (SAMPLES_PER_PROFILE + 1)
+        2, rows, n * (GRADIENT_SAMPLES_PER_PROFILE + 1)
     )
     profile_greys = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(profile_greys, dtype=np.float32).reshape(rows, n, SAMPLES_PER_PROFILE + 1)
+    return np.asarray(profile_greys, dtype=np.float32).reshape(
+        rows, n, GRADIENT_SAMPLES_PER_PROFILE + 1
+    )
 
 
 # --- Lines fitted to a marker's sides, and their intersections ---
@@ -185,9 +191,9 @@ _MIN_CELL_PX = 1.0  # smaller cells blend into one grey
 _MAX_EDGE_FIT_RMS_RESIDUAL_PX = 0.6
 _MIN_INLIER_FRACTION = 0.5
 # Robust weights reduce the squared residuals and the number of samples; this factor compensates.
-_ROBUST_LINE_VARIANCE_FACTOR = 1.7
+_TUKEY_LINE_VARIANCE_CORRECTION_FACTOR = 1.7
 # Size and range, in units of the blur, of the error that a neighbouring edge one cell away causes.
-_NEIGHBOUR_BEND, _NEIGHBOUR_BEND_RANGE_BLURS = 0.6, 2.0
+_NEIGHBOUR_ERROR_TO_BLUR_RATIO, _NEIGHBOUR_ERROR_RANGE_BLURS = 0.6, 2.0
 # Profiles are too short for wide edges. The error, px, grows with the cube of the blur.
 _EDGE_ERROR_PER_CUBED_BLUR_PER_PX2 = 0.0022
 # If white is clipped, edges move by different amounts.
@@ -195,15 +201,15 @@ CORNER_SIGMA_IF_WHITE_CLIPPED_PX = 0.1
 # White counts as clipped if more than this fraction of the profiles (or pixels) is clipped.
 MIN_CLIPPED_WHITE_FRACTION = 0.05
 # A wide edge that is off centre extends beyond its profile.
-_MIN_WIDE_BLUR_PX, _MAX_WIDE_EDGE_OFFSET_PX = 2.2, 0.5
+_MIN_WIDE_EDGE_BLUR_PX, _MAX_WIDE_EDGE_OFFSET_WITHOUT_REFIT_PX = 2.2, 0.5
 # Profiles reach at most 7 px to each side. An edge 6 px off the centre extended beyond its profile
 # and moved by up to 0.3 px.
 _MAX_EDGE_OFFSET_WITHOUT_REFIT_PX = 4.0
 # A larger ratio of the two variances shows that the image rows jitter.
 _MIN_VERTICAL_TO_HORIZONTAL_SIDE_VARIANCE_RATIO = 2.0
 # Vertical and horizontal sides can only be separated if their orientations (0 to 1) vary enough.
-_MIN_SIDE_ORIENTATION_VARIANCE = 0.05
-_MIN_FLANK_CONTRAST_GREY = 6.0  # contrast between the dark and the bright side of an edge
+_MIN_ORIENTATION_VARIANCE_FOR_ROW_JITTER = 0.05
+_MIN_MEAN_EDGE_CONTRAST_GREY = 6.0  # contrast between the dark and the bright side of an edge
 _MIN_EDGE_SHIFT_SIGMA_PX = 0.01
 _MAX_EDGE_SHIFT_PX = 1.0
 _MAX_EDGE_BLUR_CELLS = 0.45  # with more blur, the two edges of a border merge
@@ -241,25 +247,29 @@ def refine_corners_by_lines(
     by more than 0.6 cells (and by more than 1.6 px). All results are None if the corners of any
     marker are degenerate or outside the range of the lens model.
     """
-    found = _refine_lines_once(image, raw_corners_px, cells_along_border, camera, known_edge_shift)
+    found = _refine_corners_by_lines_once(
+        image, raw_corners_px, cells_along_border, camera, known_edge_shift
+    )
     centred = raw_corners_px.copy()
     for i, each in enumerate(found):
         if each is None:
             continue
         off_px = float(np.abs(each.corners_px - raw_corners_px[i]).max())
         if off_px > (
-            _MAX_WIDE_EDGE_OFFSET_PX
-            if each.blurriest_side_blur_sigma_px > _MIN_WIDE_BLUR_PX
+            _MAX_WIDE_EDGE_OFFSET_WITHOUT_REFIT_PX
+            if each.blurriest_side_blur_sigma_px > _MIN_WIDE_EDGE_BLUR_PX
             else _MAX_EDGE_OFFSET_WITHOUT_REFIT_PX
         ):
             centred[i] = each.corners_px
     if (centred == raw_corners_px).all():
         return found
-    again = _refine_lines_once(image, centred, cells_along_border, camera, known_edge_shift)
+    again = _refine_corners_by_lines_once(
+        image, centred, cells_along_border, camera, known_edge_shift
+    )
     return [second or first for first, second in zip(found, again, strict=True)]
 
 
-def _refine_lines_once(
+def _refine_corners_by_lines_once(
     image: NDArray[np.uint8],
     raw_corners_px: Array,
     cells_along_border: Sequence[CellsAlongBorder],
@@ -271,7 +281,7 @@ def _refine_lines_once(
     if markers is None:
         return found
     outer_edges, inner_edges = measure_edges(
-        image, markers, camera, with_inner_edges=known_edge_shift is None
+        image, markers, camera, must_measure_inner_edges=known_edge_shift is None
     )
     glaring = (
         np.count_nonzero(outer_edges.profile_greys[:, :, -1] > MIN_CLIPPED_GREY, axis=1)
@@ -280,7 +290,9 @@ def _refine_lines_once(
     is_white_clipped = glaring.reshape(-1, 4) @ _MEAN_OF_FOUR_WEIGHTS > MIN_CLIPPED_WHITE_FRACTION
     if known_edge_shift is not None and is_white_clipped.any():
         # The edge shift due to clipping changes with the light, so it is measured again.
-        return _refine_lines_once(image, raw_corners_px, cells_along_border, camera, None)
+        return _refine_corners_by_lines_once(
+            image, raw_corners_px, cells_along_border, camera, None
+        )
     line_nx_ny_c, rms_residual_px = _fit_lines(markers, outer_edges)
     shift = known_edge_shift
     if shift is None:
@@ -302,14 +314,18 @@ def _refine_lines_once(
     if not is_finite(corners):
         return found
     corners_px = distort_to_px(corners.reshape(-1, 2), camera).reshape(raw_corners_px.shape)
-    accepted = _are_sides_accepted(markers, outer_edges, rms_residual_px, corners_px)
+    accepted = _are_markers_accepted(markers, outer_edges, rms_residual_px, corners_px)
     # The standard deviation of a line fitted to n samples is twice as large at its ends as in its
     # middle.
     independent = np.maximum(
         np.minimum(outer_edges.weight.dot(_PROFILE_ONES), markers.side_lengths_px.ravel()), 4.0
     )
     line_end_variances_px2 = (
-        4.0 * _ROBUST_LINE_VARIANCE_FACTOR * rms_residual_px * rms_residual_px / independent
+        4.0
+        * _TUKEY_LINE_VARIANCE_CORRECTION_FACTOR
+        * rms_residual_px
+        * rms_residual_px
+        / independent
     ).tolist()
     blurs_px, side_normals_x = outer_edges.blur_sigma_px.tolist(), line_nx_ny_c[:, 0].tolist()
     for i, rim in enumerate(cells_along_border):
@@ -337,7 +353,7 @@ def _refine_lines_once(
     return found
 
 
-def _fit_lines(markers: MarkerSides, outer_edges: EdgeData) -> tuple[Array, Array]:
+def _fit_lines(markers: MarkerSides, outer_edges: MeasuredEdges) -> tuple[Array, Array]:
     """Fit a line to the edge points of each side by weighted total least squares. Return two values
     for the lines: the coefficients (4m, 3) in normalised coordinates, nx, ny, c with n.x = c and
     |n| = 1; and the weighted RMS distance, px (4m,), of the points from the lines."""
@@ -390,8 +406,8 @@ def edge_shift_prior_sigma_px(white_grey: float) -> float:
 
 def _measure_edge_shift(
     markers: MarkerSides,
-    outer_edges: EdgeData,
-    inner_edges: EdgeData | None,
+    outer_edges: MeasuredEdges,
+    inner_edges: MeasuredEdges | None,
     line_nx_ny_c: Array,
     rms_residual_px: Array,
     corners_normalised: Array,
@@ -409,7 +425,7 @@ def _measure_edge_shift(
     if inner_edges is None:
         return None
     k, prior_px = (
-        markers.widest_marker_index,
+        markers.widest_cells_marker_index,
         edge_shift_prior_sigma_px(float(outer_edges.profile_greys[:, :, -1].mean())),
     )
     rim, depth_px, cell_size_px = (
@@ -435,7 +451,7 @@ def _measure_edge_shift(
         8.0
         * r
         / (3.0 * rim.cells_per_side)
-        * _side_bow_px(markers, outer_edges, line_nx_ny_c, rms_residual_px)
+        * _side_ends_outward_bow_px(markers, outer_edges, line_nx_ny_c, rms_residual_px)
     )
     far_px = far_px + bent_px
     share = w / np.maximum(mass, 1e-9)[:, None]
@@ -459,15 +475,15 @@ def _measure_edge_shift(
     )
 
 
-def _side_bow_px(
-    markers: MarkerSides, outer_edges: EdgeData, line_nx_ny_c: Array, rms_residual_px: Array
+def _side_ends_outward_bow_px(
+    markers: MarkerSides, outer_edges: MeasuredEdges, line_nx_ny_c: Array, rms_residual_px: Array
 ) -> float:
     """Return the bow of the sides of the marker with the widest cells: by how much, px, their ends
     are further out than their middles. A parabola is fitted to the distances of each side's edge
     points from its line, and the bow is the mean over the four sides. The result is 0 if it is not
     significant compared with the noise. `line_nx_ny_c` (4m, 3) and `rms_residual_px` (4m,) are the
     results of `_fit_lines`."""
-    four = slice(4 * markers.widest_marker_index, 4 * markers.widest_marker_index + 4)
+    four = slice(4 * markers.widest_cells_marker_index, 4 * markers.widest_cells_marker_index + 4)
     away = (
         np.matmul(outer_edges.points_normalised[four], line_nx_ny_c[four, :2, None])[..., 0]
         - line_nx_ny_c[four, 2:]
@@ -492,8 +508,8 @@ def _line_normal_outward_signs(markers: MarkerSides, line_nx_ny_c: Array) -> Arr
     return np.asarray(np.sign(line_nx_ny_c[:, 0] * out[:, 0] + line_nx_ny_c[:, 1] * out[:, 1]))
 
 
-def _are_sides_accepted(
-    markers: MarkerSides, outer_edges: EdgeData, rms_residual_px: Array, corners_px: Array
+def _are_markers_accepted(
+    markers: MarkerSides, outer_edges: MeasuredEdges, rms_residual_px: Array, corners_px: Array
 ) -> NDArray[np.bool_]:
     inliers = np.count_nonzero(outer_edges.weight > 0.0, axis=1)
     # Contrast between two samples near the ends of each profile: dark inside, white outside.
@@ -503,7 +519,7 @@ def _are_sides_accepted(
     lines = (rms_residual_px < _MAX_EDGE_FIT_RMS_RESIDUAL_PX) & (
         inliers >= _MIN_INLIER_FRACTION * PROFILES_PER_SIDE
     )
-    lines &= (contrast > _MIN_FLANK_CONTRAST_GREY * PROFILES_PER_SIDE) & (
+    lines &= (contrast > _MIN_MEAN_EDGE_CONTRAST_GREY * PROFILES_PER_SIDE) & (
         outer_edges.blur_sigma_px < 0.9 * outer_edges.window_half_length_px
     )
     displacement = corners_px - markers.raw_corners_px
@@ -523,9 +539,9 @@ def _corner_sigma_px(
     # If cells are only a few pixels wide, the blur of the inner pattern reaches the border's outer
     # edge.
     bend_px = (
-        _NEIGHBOUR_BEND
+        _NEIGHBOUR_ERROR_TO_BLUR_RATIO
         * blur_sigma_px
-        * math.exp(-cell_size_px / (_NEIGHBOUR_BEND_RANGE_BLURS * blur_sigma_px))
+        * math.exp(-cell_size_px / (_NEIGHBOUR_ERROR_RANGE_BLURS * blur_sigma_px))
     )
     reach_px = _EDGE_ERROR_PER_CUBED_BLUR_PER_PX2 * blur_sigma_px**3
     clipped_px = CORNER_SIGMA_IF_WHITE_CLIPPED_PX if is_white_clipped else 0.0
@@ -549,7 +565,7 @@ def _row_jitter_sigma_px(
     upright = [x * x for x in side_normals_x]
     mean = sum(upright) / 4.0
     aspect = sum((each - mean) ** 2 for each in upright) / 4.0
-    if aspect <= _MIN_SIDE_ORIENTATION_VARIANCE:
+    if aspect <= _MIN_ORIENTATION_VARIANCE_FOR_ROW_JITTER:
         return 0.0
     both = zip(line_end_variances_px2, upright, strict=True)
     slope = sum(end * (each - mean) for end, each in both) / 4.0 / aspect
@@ -582,8 +598,8 @@ class MarkerSides:
         side_lengths_px: lengths (m, 4).
         cell_width_across_side_px: width (m, 4) of the border, perpendicular to each side.
         cell_size_px: width of a cell, the mean over the four sides, (m,).
-        widest_marker_index: index of the marker with the widest cells.
-        winding_sign: +1 if the corners are in clockwise order, -1 if counterclockwise, (m,).
+        widest_cells_marker_index: index of the marker with the widest cells.
+        clockwise_sign: +1 if the corners are in clockwise order, -1 if counterclockwise, (m,).
         px_per_normalised_unit: pixels per unit of normalised coordinates along each side, (4m,).
     """
 
@@ -593,13 +609,13 @@ class MarkerSides:
     side_lengths_px: Array
     cell_width_across_side_px: Array
     cell_size_px: Array
-    widest_marker_index: int
-    winding_sign: Array
+    widest_cells_marker_index: int
+    clockwise_sign: Array
     px_per_normalised_unit: Array
 
 
 @dataclass(frozen=True, eq=False)
-class EdgeData:
+class MeasuredEdges:
     """Edges measured on n profiles across each side. Each row is one side of a marker.
 
     Attributes:
@@ -628,7 +644,7 @@ def prepare_marker_sides(
     corners = undistort_to_normalised(raw_corners_px.reshape(-1, 2), camera).reshape(
         raw_corners_px.shape
     )
-    turn = np.sign(signed_double_area(raw_corners_px))
+    turn = np.sign(signed_double_area_clockwise(raw_corners_px))
     is_square = turn.all() and sides_px.min() > 1e-6
     if not (is_square and is_finite(corners)):
         return None
@@ -643,19 +659,22 @@ def prepare_marker_sides(
         # The inner edge is one cell further in, measured along the neighbouring sides.
         cell_width_across_side_px=0.5 * across_px / cells[:, None],
         cell_size_px=cell_size_px,
-        widest_marker_index=int(cell_size_px.argmax()),
-        winding_sign=turn,
+        widest_cells_marker_index=int(cell_size_px.argmax()),
+        clockwise_sign=turn,
         px_per_normalised_unit=(sides_px / np.hypot(along[..., 0], along[..., 1])).ravel(),
     )
 
 
 def measure_edges(
-    image: NDArray[np.uint8], markers: MarkerSides, camera: CameraModel, with_inner_edges: bool
-) -> tuple[EdgeData, EdgeData | None]:
+    image: NDArray[np.uint8],
+    markers: MarkerSides,
+    camera: CameraModel,
+    must_measure_inner_edges: bool,
+) -> tuple[MeasuredEdges, MeasuredEdges | None]:
     """Measure two sets of edges in the image: the outer edges of the black borders of all markers,
     with 4m rows, of which rows 4 i to 4 i + 3 belong to marker i; and the four inner edges of the
-    border of the marker with the widest cells (`widest_marker_index`). The inner edges are
-    None if `with_inner_edges` is False or if that marker's cells are not wider than
+    border of the marker with the widest cells (`widest_cells_marker_index`). The inner edges are
+    None if `must_measure_inner_edges` is False or if that marker's cells are not wider than
     `_MIN_CELL_TO_MEASURE_EDGE_SHIFT_PX`."""
     starts, lengths_px, depth_px = (
         markers.corners_normalised,
@@ -663,13 +682,13 @@ def measure_edges(
         markers.cell_width_across_side_px,
     )
     of = np.arange(len(starts)).repeat(4)
-    widest = markers.widest_marker_index
+    widest = markers.widest_cells_marker_index
     rim = markers.cells_along_border[widest]
-    with_inner_edges = (
-        with_inner_edges
+    must_measure_inner_edges = (
+        must_measure_inner_edges
         and float(markers.cell_size_px[widest]) > _MIN_CELL_TO_MEASURE_EDGE_SHIFT_PX
     )
-    if with_inner_edges:
+    if must_measure_inner_edges:
         r = 1.0 - 2.0 / rim.cells_per_side
         inner = apply_homography(
             homography_from_centred_square(markers.corners_normalised[widest]), r * CENTRED_SQUARE
@@ -680,12 +699,12 @@ def measure_edges(
         of = np.append(of, (widest, widest, widest, widest))
     # The normals point out of a marker with clockwise corners. A profile must start on its dark
     # side.
-    sign = markers.winding_sign[of]
-    if with_inner_edges:
+    sign = markers.clockwise_sign[of]
+    if must_measure_inner_edges:
         sign[-4:] *= -1.0
     s = profile_fractions_along_side(lengths_px.ravel())
     ends = starts.take(NEXT_CORNER, axis=1).reshape(-1, 2)
-    origin, normal = make_side_profiles(starts.reshape(-1, 2), ends, s, camera)
+    origin, normal = make_profile_centres_and_normals(starts.reshape(-1, 2), ends, s, camera)
     normal *= sign[:, None, None]
     window_half_length_px, profile_half_length_px = (
         each[of] for each in window_and_profile_half_lengths_px(markers.cell_size_px)
@@ -702,7 +721,7 @@ def measure_edges(
     points = points if is_finite(points) else np.nan_to_num(points)
     n = 4 * len(markers.raw_corners_px)
     outer_edges, inner_edges = (
-        EdgeData(
+        MeasuredEdges(
             profile_greys[part],
             window_half_length_px[part],
             points[part],
@@ -711,7 +730,7 @@ def measure_edges(
         )
         for part in (slice(0, n), slice(n, None))
     )
-    return outer_edges, inner_edges if with_inner_edges else None
+    return outer_edges, inner_edges if must_measure_inner_edges else None
 
 
 def window_and_profile_half_lengths_px(cell_size_px: Array) -> tuple[Array, Array]:
@@ -773,23 +792,23 @@ def find_neighbour_edges(
 
 _PROFILE_POSITIONS_ALONG_SIDE_F32 = PROFILE_POSITIONS_ALONG_SIDE.astype(np.float32)
 # Variance of the window relative to the blur's variance, and its lower limit.
-_WINDOW_VARIANCE_RATIO, _MIN_WINDOW_VARIANCE_PX2 = 2.25, 0.81
+_WINDOW_TO_BLUR_VARIANCE_RATIO, _MIN_WINDOW_VARIANCE_PX2 = 2.25, 0.81
 # Neighbouring edges are assumed to cause at most this fraction of the gradient.
 _MAX_NEIGHBOUR_GRADIENT_FRACTION = 0.9
 # Limits of an edge's second moment; the upper one is relative to the window's variance.
-_MIN_SECOND_MOMENT_PX2, _MAX_SECOND_MOMENT_RATIO = 0.01, 0.8
+_MIN_SECOND_MOMENT_PX2, _MAX_SECOND_MOMENT_TO_WINDOW_VARIANCE_RATIO = 0.01, 0.8
 # Half length of the wide window, in units of its standard deviation.
 _WIDE_WINDOW_HALF_LENGTH_PER_WINDOW_SIGMA = 1.0 / 0.6
 _TUKEY_CUTOFF_TO_MEDIAN_RESIDUAL_RATIO = 3.5 * 1.4826
 _PROFILE_POSITION_POWERS: Floats = (PROFILE_POSITIONS_ALONG_SIDE[:, None] ** np.arange(3)).astype(
     np.float32
 )
-_SAMPLE_ONES: Floats = np.ones(SAMPLES_PER_PROFILE, dtype=np.float32)
+_SAMPLE_ONES: Floats = np.ones(GRADIENT_SAMPLES_PER_PROFILE, dtype=np.float32)
 # A profile is usable if its gradient is at least this fraction of the mean gradient in its row.
 _MIN_PROFILE_TO_MEAN_GRADIENT_RATIO = 0.3
 _MIN_TUKEY_CUTOFF_PX = 3.5 * 0.05  # A smaller cutoff would reject ordinary noise.
 # If the wide window is off by less than this, one iteration with the narrow window is enough.
-_MAX_WIDE_WINDOW_EDGE_ERROR_PX = 0.2
+_MAX_LINE_CHANGE_TO_SKIP_ITERATION_PX = 0.2
 _MAX_CONVERGED_LINE_CHANGE_PX = 0.06
 _LINE_FIT_ITERATIONS = 3
 _OUT_OF_RANGE_OFFSET_PX = 1e6
@@ -853,7 +872,7 @@ def locate_edges(
     line = weight = _fit_line_to_half_side_midmeans(edge_offsets_px, is_usable)
     moved_px = np.inf
     for k in range(_LINE_FIT_ITERATIONS):
-        if k == 1 and moved_px < _MAX_WIDE_WINDOW_EDGE_ERROR_PX:
+        if k == 1 and moved_px < _MAX_LINE_CHANGE_TO_SKIP_ITERATION_PX:
             continue
         edge_offsets_px, is_usable, blur_variance_px2 = profiles.locate_in_narrow_window(
             line, blur_variance_px2
@@ -879,27 +898,29 @@ class _EdgeProfiles:
         profile_greys: Floats,
         profile_half_length_px: Array,
         window_half_length_px: Array,
-        around: NeighbourEdges,
+        neighbours: NeighbourEdges,
     ) -> None:
         self.gradient = profile_greys[:, :, 1:] - profile_greys[:, :, :-1]
         # positions of the gradient samples, px (rows, steps)
-        self.u = (
+        self.sample_positions_px = (
             profile_half_length_px.astype(np.float32)[:, None] * GRADIENT_POSITIONS_HALF_LENGTHS
         )
-        self.near, self.depth = (
+        self.window_half_length_px, self.neighbour_distance_px = (
             window_half_length_px.astype(np.float32),
-            around.neighbour_distance_px.astype(np.float32),
+            neighbours.neighbour_distance_px.astype(np.float32),
         )
-        self.most2 = 0.25 * self.near * self.near  # Maximum variance of a window.
+        self.max_window_variance_px2 = (
+            0.25 * self.window_half_length_px * self.window_half_length_px
+        )  # Maximum variance of a window.
         # Number of neighbouring edges on both sides, and the difference outside minus inside.
-        self.both, self.side = (
-            around.inner_neighbour_count + around.outer_neighbour_count,
-            around.outer_neighbour_count - around.inner_neighbour_count,
+        self.neighbour_count, self.outer_minus_inner_neighbour_count = (
+            neighbours.inner_neighbour_count + neighbours.outer_neighbour_count,
+            neighbours.outer_neighbour_count - neighbours.inner_neighbour_count,
         )
-        self.can = around.is_edge_locatable.astype(np.float32)
+        self.edge_locatable_f32 = neighbours.is_edge_locatable.astype(np.float32)
         # The sum over a row's profiles times this factor is the minimum gradient of a usable one.
-        self.part = _MIN_PROFILE_TO_MEAN_GRADIENT_RATIO / np.maximum(
-            self.can.dot(_PROFILE_ONES_F32), 1.0
+        self.min_gradient_to_row_sum_ratio = _MIN_PROFILE_TO_MEAN_GRADIENT_RATIO / np.maximum(
+            self.edge_locatable_f32.dot(_PROFILE_ONES_F32), 1.0
         )
 
     def locate_in_wide_window(self) -> tuple[Floats, NDArray[np.bool_]]:
@@ -907,14 +928,19 @@ class _EdgeProfiles:
         Gaussian window around the middle of the profile. Return the edge offsets from the middle,
         px (rows, n), positive towards the bright end, and whether each profile is usable (rows, n):
         whether its gradient is strong enough."""
-        spread = self.u * (_WIDE_WINDOW_HALF_LENGTH_PER_WINDOW_SIGMA / self.near)[:, None]
+        spread = (
+            self.sample_positions_px
+            * (_WIDE_WINDOW_HALF_LENGTH_PER_WINDOW_SIGMA / self.window_half_length_px)[:, None]
+        )
         spread *= spread
-        window = np.empty((*self.u.shape, 2), dtype=np.float32)
+        window = np.empty((*self.sample_positions_px.shape, 2), dtype=np.float32)
         np.exp(-0.5 * spread, out=window[..., 0])
-        np.multiply(window[..., 0], self.u, out=window[..., 1])
+        np.multiply(window[..., 0], self.sample_positions_px, out=window[..., 1])
         moments: Floats = np.maximum(self.gradient, 0.0) @ window
-        total = moments[..., 0] * self.can
-        is_usable = total > (total.dot(_PROFILE_ONES_F32) * self.part)[:, None]
+        total = moments[..., 0] * self.edge_locatable_f32
+        is_usable = (
+            total > (total.dot(_PROFILE_ONES_F32) * self.min_gradient_to_row_sum_ratio)[:, None]
+        )
         return np.divide(moments[..., 1], np.where(is_usable, total, 1.0)), is_usable
 
     def locate_in_narrow_window(
@@ -926,27 +952,37 @@ class _EdgeProfiles:
         the gradient is corrected for the window and for neighbouring edges. Return the edge offsets
         from the middle, px (rows, n), positive towards the bright end, whether each profile is
         usable (rows, n), and the variance of the blur, px^2 (rows,)."""
-        relative = self.u[:, None, :] - line_offsets_px[:, :, None]
+        relative = self.sample_positions_px[:, None, :] - line_offsets_px[:, :, None]
         # The second moment under a Gaussian window w is m2 with 1/m2 = 1/blur^2 + 1/w^2.
         w2 = np.minimum(
-            np.maximum(_WINDOW_VARIANCE_RATIO * blur_variance_px2, _MIN_WINDOW_VARIANCE_PX2),
-            self.most2,
+            np.maximum(
+                _WINDOW_TO_BLUR_VARIANCE_RATIO * blur_variance_px2, _MIN_WINDOW_VARIANCE_PX2
+            ),
+            self.max_window_variance_px2,
         )
         squared = relative * relative
         mass = squared * (-0.5 / w2)[:, None, None]
         np.exp(mass, out=mass)
         mass *= self.gradient
-        total = (mass @ _SAMPLE_ONES) * self.can
-        is_usable = total > np.maximum(total.dot(_PROFILE_ONES_F32) * self.part, 1e-9)[:, None]
+        total = (mass @ _SAMPLE_ONES) * self.edge_locatable_f32
+        is_usable = (
+            total
+            > np.maximum(total.dot(_PROFILE_ONES_F32) * self.min_gradient_to_row_sum_ratio, 1e-9)[
+                :, None
+            ]
+        )
         # Share of the gradient, position and spread of a neighbouring edge, as seen through the
         # window.
         wide2 = w2 + blur_variance_px2
-        place = self.depth * w2 / wide2
-        lost = np.exp(-0.5 * self.depth * self.depth / wide2)
-        share = np.minimum(self.both * lost[:, None], _MAX_NEIGHBOUR_GRADIENT_FRACTION)
+        place = self.neighbour_distance_px * w2 / wide2
+        lost = np.exp(-0.5 * self.neighbour_distance_px * self.neighbour_distance_px / wide2)
+        share = np.minimum(self.neighbour_count * lost[:, None], _MAX_NEIGHBOUR_GRADIENT_FRACTION)
         total = np.where(is_usable, total / (1.0 - share), 1.0)
         relative *= mass
-        first = relative @ _SAMPLE_ONES + total * self.side * (lost * place)[:, None]
+        first = (
+            relative @ _SAMPLE_ONES
+            + total * self.outer_minus_inner_neighbour_count * (lost * place)[:, None]
+        )
         mass *= squared
         second = (
             mass @ _SAMPLE_ONES
@@ -955,12 +991,13 @@ class _EdgeProfiles:
         moment = (second * is_usable).dot(_PROFILE_ONES_F32)
         moment /= np.maximum((total * is_usable).dot(_PROFILE_ONES_F32), 1e-9)
         moment = np.minimum(
-            np.maximum(moment, _MIN_SECOND_MOMENT_PX2), _MAX_SECOND_MOMENT_RATIO * w2
+            np.maximum(moment, _MIN_SECOND_MOMENT_PX2),
+            _MAX_SECOND_MOMENT_TO_WINDOW_VARIANCE_RATIO * w2,
         )
         found2 = moment * w2 / (w2 - moment)
         # Correct for the window, which pulls the centroid towards its middle.
         centroid = first / total * (1.0 + found2 / w2)[:, None]
-        limit = self.near[:, None]
+        limit = self.window_half_length_px[:, None]
         return line_offsets_px + np.minimum(np.maximum(centroid, -limit), limit), is_usable, found2
 
 

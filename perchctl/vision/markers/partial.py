@@ -29,7 +29,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision.lens import distort_to_px, pinhole_px, undistort_px, undistort_to_normalised
+from perchctl.vision.lens import (
+    distort_to_px,
+    normalised_to_pinhole_px,
+    undistort_px,
+    undistort_to_normalised,
+)
 from perchctl.vision.markers.corners import (
     CENTRED_SQUARE,
     NEXT_CORNER,
@@ -43,19 +48,19 @@ from perchctl.vision.markers.corners import (
     is_inside_image,
     mean_side_px,
     side_lengths_px,
-    signed_double_area,
+    signed_double_area_clockwise,
 )
 from perchctl.vision.markers.detector import DetectorInput, is_any_marker_part_hidden
 from perchctl.vision.markers.edge_fit import (
+    GRADIENT_SAMPLES_PER_PROFILE,
     MIN_LINE_SIGMA_PX,
     PROFILES_PER_SIDE,
-    SAMPLES_PER_PROFILE,
     Floats,
     NeighbourEdges,
     edge_shift_prior_sigma_px,
     find_neighbour_edges,
     locate_edges,
-    make_side_profiles,
+    make_profile_centres_and_normals,
     profile_fractions_along_side,
     sample_profiles,
     window_and_profile_half_lengths_px,
@@ -70,7 +75,7 @@ from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
 
 # With smaller cells, a part of a side carries no information.
 MIN_CELL_FOR_PARTIAL_FIT_PX = 4.0
-_PARTIAL_FIT_ITERATIONS, _CONVERGED_PARTIAL_PX = 5, 0.05
+_MAX_ITERATIONS, _MAX_CONVERGED_STEP_PX = 5, 0.05
 _MAX_EDGE_FIT_RMS_RESIDUAL_PX = 0.6
 _MAX_BLUR_TO_WINDOW_HALF_LENGTH_RATIO = 0.9
 _MAX_CORNER_SIGMA_SIDES = 0.02  # Corners with a larger standard deviation are rejected.
@@ -116,11 +121,11 @@ def fit_partly_visible_marker(
     if not np.isfinite(start).all() or side_lengths_px(start).min() < 1.0:
         return None
     H_pinhole_marker = homography_from_centred_square(start)
-    for k in range(_PARTIAL_FIT_ITERATIONS):
+    for k in range(_MAX_ITERATIONS):
         visible_edges = find_visible_edges(detector_input, H_pinhole_marker, pattern)
         if visible_edges is None:
             return None
-        A, N, g = _linearize_edges(
+        A, N, g = _make_edge_normal_equations(
             visible_edges,
             known_edge_shift or EdgeShift(0.0, edge_shift_prior_sigma_px(visible_edges.white_grey)),
         )
@@ -132,7 +137,7 @@ def fit_partly_visible_marker(
         if (
             k > 0
             and float(np.abs(p[:6]).max() * visible_edges.px_per_half_side.mean())
-            < _CONVERGED_PARTIAL_PX
+            < _MAX_CONVERGED_STEP_PX
         ):
             break
     assert visible_edges is not None
@@ -157,7 +162,7 @@ def is_fully_visible(detector_input: DetectorInput, corners: RefinedCorners) -> 
     ) and not is_any_marker_part_hidden(detector_input.hidden_mask, corners.corners_px)
 
 
-def _linearize_edges(
+def _make_edge_normal_equations(
     visible_edges: VisibleEdges, edge_shift_prior: EdgeShift
 ) -> tuple[Array, Array, Array]:
     """Linearise the offsets of the edges, px, with respect to nine unknowns: the increment of the
@@ -269,10 +274,10 @@ def _make_refined_corners(
 IdentificationEvidence = Literal["bits", "track", "other_marker"]
 """What identifies a marker: its cells alone ("bits"), the position predicted for it ("track"), or
 the other marker."""
-_MIN_KNOWN_CELL_FRACTION = 0.6
+_MIN_VISIBLE_CELL_FRACTION = 0.6
 # A sample counts as glare if it is brighter than white by more than this fraction of the contrast,
 # or if it is at least as bright as this grey level although white is not.
-_GLARE, _BRIGHTEST_GREY = 0.25, 250.0
+_MIN_GLARE_EXCESS_TO_CONTRAST_RATIO, _MIN_SATURATED_GREY = 0.25, 250.0
 # Other codewords differ from the marker's in two bits.
 _MAX_INVISIBLE_BITS: dict[IdentificationEvidence, int] = {"bits": 1, "track": 4}
 _MAX_LENS_INVERSION_ERROR_PX = 0.5  # The lens model is valid where its inverse exists.
@@ -307,23 +312,25 @@ def _has_matching_visible_cells(
     contrast = high - low
     if contrast < MIN_CONTRAST_GREY:
         return False
-    is_sample_visible &= grey <= high + _GLARE * contrast
-    if high < _BRIGHTEST_GREY - _GLARE * contrast:
-        is_sample_visible &= grey < _BRIGHTEST_GREY
+    is_sample_visible &= grey <= high + _MIN_GLARE_EXCESS_TO_CONTRAST_RATIO * contrast
+    if high < _MIN_SATURATED_GREY - _MIN_GLARE_EXCESS_TO_CONTRAST_RATIO * contrast:
+        is_sample_visible &= grey < _MIN_SATURATED_GREY
     count = np.bincount(pattern.sample_cell_index, weights=is_sample_visible)
     means = np.bincount(pattern.sample_cell_index, weights=grey * is_sample_visible) / np.maximum(
         count, 1.0
     )
-    is_known = _is_cell_visible(is_sample_visible, pattern)
+    is_cell_visible = _is_cell_visible(is_sample_visible, pattern)
     share = (means - 0.5 * (high + low)) / contrast * np.where(pattern.is_cell_white, 1.0, -1.0)
-    wrong = np.count_nonzero(is_known & (share < MIN_CELL_MARGIN_TO_CONTRAST_RATIO))
+    wrong = np.count_nonzero(is_cell_visible & (share < MIN_CELL_MARGIN_TO_CONTRAST_RATIO))
     most_wrong = 0
     if identified_by == "other_marker":
         most_wrong = math.floor(
             (1.0 - MIN_MATCHING_CELL_FRACTION)
-            * np.count_nonzero(is_known & pattern.is_cell_inside_border)
+            * np.count_nonzero(is_cell_visible & pattern.is_cell_inside_border)
         )
-    return bool(wrong <= most_wrong) and _are_enough_cells_visible(is_known, pattern, identified_by)
+    return bool(wrong <= most_wrong) and _are_enough_cells_visible(
+        is_cell_visible, pattern, identified_by
+    )
 
 
 def _project_sample_points_px(
@@ -363,22 +370,26 @@ def _is_cell_visible(
 ) -> NDArray[np.bool_]:
     """Return for each cell (cells,) whether at least half of its sample points are visible, given
     `is_sample_visible` (n,), one value for each of the pattern's sample points."""
-    is_known: NDArray[np.bool_] = (
+    is_cell_visible: NDArray[np.bool_] = (
         np.bincount(pattern.sample_cell_index, weights=is_sample_visible)
         >= 0.5 * pattern.samples_per_cell
     )
-    return is_known
+    return is_cell_visible
 
 
 def _are_enough_cells_visible(
-    is_known: NDArray[np.bool_], pattern: MarkerPattern, identified_by: IdentificationEvidence
+    is_cell_visible: NDArray[np.bool_],
+    pattern: MarkerPattern,
+    identified_by: IdentificationEvidence,
 ) -> bool:
     most_unknown = (
-        len(is_known) if identified_by == "other_marker" else _MAX_INVISIBLE_BITS[identified_by]
+        len(is_cell_visible)
+        if identified_by == "other_marker"
+        else _MAX_INVISIBLE_BITS[identified_by]
     )
     return bool(
-        np.count_nonzero(pattern.is_cell_inside_border & ~is_known) <= most_unknown
-        and np.count_nonzero(is_known) >= _MIN_KNOWN_CELL_FRACTION * len(is_known)
+        np.count_nonzero(pattern.is_cell_inside_border & ~is_cell_visible) <= most_unknown
+        and np.count_nonzero(is_cell_visible) >= _MIN_VISIBLE_CELL_FRACTION * len(is_cell_visible)
     )
 
 
@@ -391,14 +402,14 @@ IMAGE_BORDER_MARGIN_PX = 2.0
 _MIN_CELL_TO_MEASURE_INNER_EDGE_PX = 6.0
 # A clean profile deviates from black on its dark side, and from white on its bright side, by less
 # than these fractions of the contrast.
-_BLACK_MARGIN, _WHITE_MARGIN = 0.2, 0.5
+_MAX_DARK_DEVIATION_TO_CONTRAST_RATIO, _MAX_BRIGHT_DEVIATION_TO_CONTRAST_RATIO = 0.2, 0.5
 _MIN_PARTIAL_MARKER_CONTRAST_GREY = 10.0
 _MIN_PROFILE_WEIGHT_SUM_PER_SIDE = 3.0
 _MIN_VISIBLE_EDGES = 4  # A square has eight unknowns, and an edge determines two of them.
-_OUT_OF_RANGE_OFFSET_PX = 1e6
-_WINDOW_SAMPLE_OFFSETS_HALF_LENGTHS: Array = np.linspace(-1.0, 1.0, SAMPLES_PER_PROFILE // 2 + 1)[
-    :, None
-]
+_MAX_PROFILE_COORDINATE_PX = 1e6
+_WINDOW_SAMPLE_OFFSETS_HALF_LENGTHS: Array = np.linspace(
+    -1.0, 1.0, GRADIENT_SAMPLES_PER_PROFILE // 2 + 1
+)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -456,12 +467,12 @@ def find_visible_edges(
     scale_px = (0.25 * (sides_px[PREVIOUS_CORNER] + sides_px[NEXT_CORNER]))[side]
     s = profile_fractions_along_side(sides_px[side] * at)
     ends = starts[:, NEXT_CORNER].reshape(-1, 2)
-    origin, normal = make_side_profiles(starts.reshape(-1, 2), ends, s, camera)
+    origin, normal = make_profile_centres_and_normals(starts.reshape(-1, 2), ends, s, camera)
     # Far outside the image, a lens model may return any position, even NaN.
-    if not (np.abs(origin) < _OUT_OF_RANGE_OFFSET_PX).all():
+    if not (np.abs(origin) < _MAX_PROFILE_COORDINATE_PX).all():
         return None
     # The paper is white outside the marker and, for the inner edges, inside the border.
-    turn = float(np.sign(signed_double_area(corners[None])[0]))
+    turn = float(np.sign(signed_double_area_clockwise(corners[None])[0]))
     normal *= (turn * np.where(at < 1.0, -1.0, 1.0))[:, None, None]
     window_half_length_px, profile_half_length_px = window_and_profile_half_lengths_px(
         np.full(len(at), cell_size_px)
@@ -485,7 +496,7 @@ def find_visible_edges(
         profile_half_length_px[kept],
     )
     profile_greys = sample_profiles(detector_input.image, origin, normal, profile_half_length_px)
-    lit = _find_clean_profiles(
+    lit = _find_clean_edge_profiles(
         profile_greys, is_unobstructed, window_half_length_px, profile_half_length_px
     )
     if lit is None:
@@ -501,7 +512,7 @@ def find_visible_edges(
     weight[weight.sum(axis=1) < _MIN_PROFILE_WEIGHT_SUM_PER_SIDE] = 0.0
     found = undistort_to_normalised((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
     own = apply_homography(
-        np.asarray(np.linalg.inv(H_pinhole_marker)), pinhole_px(found, camera)
+        np.asarray(np.linalg.inv(H_pinhole_marker)), normalised_to_pinhole_px(found, camera)
     ).reshape(origin.shape)
     if not np.isfinite(own).all():
         return None
@@ -546,7 +557,7 @@ def _is_profile_in_view(
     return np.asarray(seen)
 
 
-def _find_clean_profiles(
+def _find_clean_edge_profiles(
     profile_greys: Floats,
     is_unobstructed: NDArray[np.bool_],
     window_half_length_px: Array,
@@ -566,17 +577,19 @@ def _find_clean_profiles(
         1,
         round(
             0.5
-            * SAMPLES_PER_PROFILE
+            * GRADIENT_SAMPLES_PER_PROFILE
             * float((0.6 * window_half_length_px / profile_half_length_px)[0])
         ),
     )
     dark, bright = (
-        profile_greys[:, :, SAMPLES_PER_PROFILE // 2 - off],
-        profile_greys[:, :, SAMPLES_PER_PROFILE // 2 + off],
+        profile_greys[:, :, GRADIENT_SAMPLES_PER_PROFILE // 2 - off],
+        profile_greys[:, :, GRADIENT_SAMPLES_PER_PROFILE // 2 + off],
     )
     black, white = (float(np.median(each[is_unobstructed])) for each in (dark, bright))
     contrast = white - black
     if contrast < _MIN_PARTIAL_MARKER_CONTRAST_GREY:
         return None
-    good = (dark < black + _BLACK_MARGIN * contrast) & (bright > white - _WHITE_MARGIN * contrast)
+    good = (dark < black + _MAX_DARK_DEVIATION_TO_CONTRAST_RATIO * contrast) & (
+        bright > white - _MAX_BRIGHT_DEVIATION_TO_CONTRAST_RATIO * contrast
+    )
     return is_unobstructed & good, white

@@ -238,10 +238,10 @@ def _sample_blurred_drawing(drawing: MarkerDrawing, sample_points_half_sides: Ar
     from the marker's centre, after a blur with a standard deviation of half a cell. The small
     marker is not drawn."""
     n, fine = len(drawing.cell_whiteness), 8
-    sharp_nodes = np.kron(
+    sharp_node_values = np.kron(
         np.pad(drawing.cell_whiteness, 2, constant_values=1.0), np.ones((fine, fine))
     )
-    white = np.asarray(cv2.GaussianBlur(sharp_nodes, (0, 0), 0.5 * fine), dtype=np.float64)
+    white = np.asarray(cv2.GaussianBlur(sharp_node_values, (0, 0), 0.5 * fine), dtype=np.float64)
     at = (((sample_points_half_sides + 1.0) * 0.5 * n + 2.0) * fine).astype(np.intp)
     return np.asarray(white[at[:, 1], at[:, 0]])
 
@@ -261,7 +261,7 @@ class MarkerDrawing:
     The drawing of the large marker also contains the small marker: `small_marker_cell_whiteness`
     are the cells of the small marker, and `small_to_large_side_ratio` is its side divided by the
     side of the large marker. Nothing of the large marker is printed up to
-    `ring_reach_half_sides` from the centre, the outer edge of the white ring around the small
+    `white_ring_reach_half_sides` from the centre, the outer edge of the white ring around the small
     marker.
 
     `paper_reach_half_sides` is half the side of the paper in the marker's coordinates; None if the
@@ -270,7 +270,7 @@ class MarkerDrawing:
     cell_whiteness: Array
     small_marker_cell_whiteness: Array | None = None
     small_to_large_side_ratio: float = 0.0
-    ring_reach_half_sides: float = 0.0
+    white_ring_reach_half_sides: float = 0.0
     paper_reach_half_sides: float | None = None
 
     @property
@@ -284,7 +284,7 @@ def make_marker_drawing(
     bits: NDArray[np.uint8],
     small_marker_bits: NDArray[np.uint8] | None = None,
     small_to_large_side_ratio: float = 0.0,
-    ring_reach_half_sides: float = 0.0,
+    white_ring_reach_half_sides: float = 0.0,
 ) -> MarkerDrawing:
     """Return the drawing of a marker with inner bits `bits` (n, n), 1 = white, to which a black
     border is added.
@@ -293,7 +293,7 @@ def make_marker_drawing(
 
     - `small_marker_bits` (m, m): its inner bits, 1 = white.
     - `small_to_large_side_ratio`: its side divided by the side of the large marker.
-    - `ring_reach_half_sides`: the distance from the centre to the outer edge of the white
+    - `white_ring_reach_half_sides`: the distance from the centre to the outer edge of the white
       ring around it, in half sides of the large marker; if it is less than the half side of the
       small marker, that half side is used.
 
@@ -307,7 +307,7 @@ def make_marker_drawing(
         cells,
         np.pad(small_marker_bits.astype(np.float64), 1),
         small_to_large_side_ratio,
-        max(ring_reach_half_sides, small_to_large_side_ratio),
+        max(white_ring_reach_half_sides, small_to_large_side_ratio),
         1.0 + 2.0 / len(cells),
     )
 
@@ -317,15 +317,15 @@ def _cell_coverage(
     node_reach_half_sides: float,
     cells_per_side: int,
     square_reach_half_sides: float,
-    covered_reach_half_sides: float = math.inf,
+    max_counted_reach_half_sides: float = math.inf,
 ) -> Array:
     """Return the fraction of each node's interval that each cell covers, (nodes, cells), along one
     axis. A node's interval extends `node_reach_half_sides` to each side of its position. The
     `cells_per_side` cells fill the interval from -square_reach_half_sides to
-    square_reach_half_sides; of each cell, only the part up to `covered_reach_half_sides` from
+    square_reach_half_sides; of each cell, only the part up to `max_counted_reach_half_sides` from
     the centre counts. Lengths are in half sides from the marker's centre."""
     edges = square_reach_half_sides * np.linspace(-1.0, 1.0, cells_per_side + 1)
-    edges = np.clip(edges, -covered_reach_half_sides, covered_reach_half_sides)
+    edges = np.clip(edges, -max_counted_reach_half_sides, max_counted_reach_half_sides)
     low, high = (
         node_positions_half_sides[:, None] - node_reach_half_sides,
         node_positions_half_sides[:, None] + node_reach_half_sides,
@@ -405,7 +405,7 @@ def render_cells(
             node_reach_half_sides,
             len(drawing.cell_whiteness),
             1.0,
-            drawing.ring_reach_half_sides,
+            drawing.white_ring_reach_half_sides,
         )
         black -= C @ (1.0 - drawing.cell_whiteness) @ C.T
         C = _cell_coverage(
@@ -447,11 +447,15 @@ def blurred_cell_coverage(
     )
 
 
-def blur_nodes(sharp_nodes: NDArray[np.float32], blur_sigma_nodes: float) -> NDArray[np.float32]:
-    """Return the values `sharp_nodes` (k, k) at the nodes of a grid after a Gaussian blur.
+def blur_node_values(
+    sharp_node_values: NDArray[np.float32], blur_sigma_nodes: float
+) -> NDArray[np.float32]:
+    """Return the values `sharp_node_values` (k, k) at the nodes of a grid after a Gaussian blur.
 
     The blur has the standard deviation `blur_sigma_nodes`, in node spacings. Both arrays include a
     margin of `BLUR_MARGIN_NODES` nodes on all sides, in which the result is less accurate.
     """
-    soft = cv2.GaussianBlur(sharp_nodes, (0, 0), blur_sigma_nodes, borderType=cv2.BORDER_REPLICATE)
+    soft = cv2.GaussianBlur(
+        sharp_node_values, (0, 0), blur_sigma_nodes, borderType=cv2.BORDER_REPLICATE
+    )
     return np.asarray(soft, np.float32)

@@ -43,7 +43,7 @@ from perchctl.vision.markers.corners import (
 from perchctl.vision.markers.pattern import (
     BLUR_MARGIN_NODES,
     MarkerDrawing,
-    blur_nodes,
+    blur_node_values,
     blurred_cell_coverage,
     render_black_square,
     render_whiteness_and_off_paper_fraction,
@@ -62,31 +62,31 @@ _MAX_DISTORTION_REUSE_MOTION_PX = 0.3
 _MAX_HOMOGRAPHY_INCREMENT = 0.5  # With a larger increment, the fit has diverged.
 # Standard deviations of the change of shape since the start, in half sides: of rotations and
 # scales, and of the perspective.
-_SHAPE_SIGMA, _PERSPECTIVE_SIGMA = 0.2, 0.03
+_ROTATION_SCALE_PRIOR_SIGMA, _PERSPECTIVE_PRIOR_SIGMA = 0.2, 0.03
 # Standard deviation of the bend of the tone curve, relative to the gain.
-_TONE_CURVE_PRIOR_SIGMA = 0.5
-_MIN_BLUR_PX, _MAX_BLUR_CELLS = 0.35, 1.6
+_TONE_CURVE_BEND_PRIOR_SIGMA = 0.5
+_MIN_BLUR_SIGMA_PX, _MAX_BLUR_SIGMA_CELLS = 0.35, 1.6
 # In one iteration, the variance of the blur changes at most by this fraction of itself, or by one
 # squared node spacing if that is larger.
 _MAX_BLUR_VARIANCE_STEP_FRACTION = 0.5
-_BLUR_STEP, _BLUR_STEP_CELLS = 0.05, 0.02
+_RERENDER_BLUR_CHANGE_FRACTION, _RERENDER_BLUR_CHANGE_CELLS = 0.05, 0.02
 """The drawing is not rendered again for a change of the blur that is below both limits: a fraction
 of the blur, and a fraction of a cell."""
 _MIN_FITTED_CONTRAST_GREY = 10.0
 _MIN_SIDE_PX, _MAX_SIDE_PX = 4.0, 2000.0
 # Indices of the unknowns: homography increment, blur, illumination.
-_SHAPE_SLICE, _BLUR_INDEX, _LIGHT_INDEX = slice(0, 8), 8, 9
+_HOMOGRAPHY_SLICE, _BLUR_VARIANCE_INDEX, _FIRST_ILLUMINATION_INDEX = slice(0, 8), 8, 9
 _HOMOGRAPHY_INCREMENT_PRIOR_INFORMATION: Array = (
     np.array(
         [
-            _SHAPE_SIGMA,
-            _SHAPE_SIGMA,
+            _ROTATION_SCALE_PRIOR_SIGMA,
+            _ROTATION_SCALE_PRIOR_SIGMA,
             1e3,
-            _SHAPE_SIGMA,
-            _SHAPE_SIGMA,
+            _ROTATION_SCALE_PRIOR_SIGMA,
+            _ROTATION_SCALE_PRIOR_SIGMA,
             1e3,
-            _PERSPECTIVE_SIGMA,
-            _PERSPECTIVE_SIGMA,
+            _PERSPECTIVE_PRIOR_SIGMA,
+            _PERSPECTIVE_PRIOR_SIGMA,
         ]
     )
     ** -2.0
@@ -187,7 +187,7 @@ def align_drawing(
         return render_blurred(drawing, n, round(math.log(blur_px / node_px) / _LOG_BLUR_TABLE_STEP))
 
     def limit_blur_px(blur_px: float) -> float:
-        return min(max(blur_px, _MIN_BLUR_PX), _MAX_BLUR_CELLS * cell_size_px)
+        return min(max(blur_px, _MIN_BLUR_SIGMA_PX), _MAX_BLUR_SIGMA_CELLS * cell_size_px)
 
     rendered_drawing = drawn(limit_blur_px(initial_blur_sigma_px))
     distortion_shift_minus_patch_corner_px, since_lens_px, homography_increment_from_start = (
@@ -202,18 +202,18 @@ def align_drawing(
                 0.0,
             )
         grey = _sample_patch(around, grid, H_pinhole_marker, distortion_shift_minus_patch_corner_px)
-        equations = _linearize_greys(grey, rendered_drawing, homography_increment_from_start)
+        equations = _make_normal_equations(grey, rendered_drawing, homography_increment_from_start)
         if equations is None:
             return None
         if (
             k == _EARLY_CHECK_ITERATIONS
-            and fit_correlation(grey, equations.grey_residual) < _MIN_EARLY_CORRELATION
+            and correlation_from_residual(grey, equations.grey_residual) < _MIN_EARLY_CORRELATION
         ):
             return None
         step = np.asarray(
             np.linalg.solve(equations.normal_matrix, equations.right_hand_side), dtype=np.float64
         )
-        p = step[_SHAPE_SLICE]
+        p = step[_HOMOGRAPHY_SLICE]
         if not (np.isfinite(p).all() and np.abs(p).max() <= _MAX_HOMOGRAPHY_INCREMENT):
             return None
         H_pinhole_marker, homography_increment_from_start = (
@@ -224,10 +224,12 @@ def align_drawing(
         since_lens_px += motion_px
         sigma2 = rendered_drawing.blur_sigma_nodes**2
         most = max(1.0, _MAX_BLUR_VARIANCE_STEP_FRACTION * sigma2)
-        squared = sigma2 + float(np.clip(step[_BLUR_INDEX], -most, most))
+        squared = sigma2 + float(np.clip(step[_BLUR_VARIANCE_INDEX], -most, most))
         wanted_px = limit_blur_px(math.sqrt(max(squared, 1e-3)) * node_px)
         drawn_px = rendered_drawing.blur_sigma_nodes * node_px
-        if abs(wanted_px - drawn_px) > min(_BLUR_STEP * drawn_px, _BLUR_STEP_CELLS * cell_size_px):
+        if abs(wanted_px - drawn_px) > min(
+            _RERENDER_BLUR_CHANGE_FRACTION * drawn_px, _RERENDER_BLUR_CHANGE_CELLS * cell_size_px
+        ):
             rendered_drawing = drawn(wanted_px)
         elif (
             motion_px < _MAX_CONVERGED_STEP_PX and since_lens_px <= _MAX_DISTORTION_REUSE_MOTION_PX
@@ -252,7 +254,10 @@ def align_drawing(
         float(
             np.trace(
                 J
-                @ (inverse_normal_matrix[_SHAPE_SLICE, _SHAPE_SLICE] * nodes_per_independent_sample)
+                @ (
+                    inverse_normal_matrix[_HOMOGRAPHY_SLICE, _HOMOGRAPHY_SLICE]
+                    * nodes_per_independent_sample
+                )
                 @ J.T
             )
         )
@@ -261,7 +266,7 @@ def align_drawing(
     return DrawingAlignment(
         corners_px=corners_px,
         sigma_px=math.sqrt(max(variance, 0.0)),
-        fit_correlation=fit_correlation(grey, grey_residual),
+        fit_correlation=correlation_from_residual(grey, grey_residual),
         pattern_correlation=pattern_correlation,
         pattern_to_border_contrast_ratio=pattern_to_border_contrast_ratio,
         largest_cell_grey_deviation_to_contrast_ratio=_largest_cell_grey_deviation(
@@ -274,7 +279,7 @@ def align_drawing(
     )
 
 
-def _linearize_greys(
+def _make_normal_equations(
     grey: Array, rendered_drawing: RenderedDrawing, homography_increment_from_start: Array
 ) -> _NormalEquations | None:
     """Linearise the fit to the image's grey values `grey` (n * n,) at the nodes, and return its
@@ -284,32 +289,42 @@ def _linearize_greys(
     towards zero."""
     rows, products = rendered_drawing.illumination_basis
     A = products + 1e-6 * np.eye(len(products))
-    A[BEND, BEND] += 1e-3 * len(grey)  # keeps the bend at zero unless it is visible
+    A[TONE_CURVE_BEND, TONE_CURVE_BEND] += 1e-3 * len(
+        grey
+    )  # keeps the bend at zero unless it is visible
     illumination = np.asarray(np.linalg.solve(A, np.einsum("kn,n->k", rows, grey)))
     contrast_grey = float(illumination[GAIN])
     if contrast_grey < _MIN_FITTED_CONTRAST_GREY:
         return None
     grey_residual = grey - np.einsum("kn,k->n", rows, illumination)
     J = np.concatenate(
-        [_illuminated_jacobian(rendered_drawing, illumination), rows, grey_residual[None]]
+        [
+            _grey_jacobian_under_illumination(rendered_drawing, illumination),
+            rows,
+            grey_residual[None],
+        ]
     )
     noise = max(float((grey_residual**2).mean()), 1.0)
     products = gram_matrix(J) / noise
     J, N, g = J[:-1], products[:-1, :-1], products[:-1, -1]
-    bend = _LIGHT_INDEX + BEND
-    N[_BLUR_INDEX, _BLUR_INDEX] += 1.0  # limits the step to about a node's width
-    N[bend, bend] += (_TONE_CURVE_PRIOR_SIGMA * contrast_grey) ** -2.0
-    g[bend] -= illumination[BEND] * (_TONE_CURVE_PRIOR_SIGMA * contrast_grey) ** -2.0
-    N[range(_LIGHT_INDEX, len(g)), range(_LIGHT_INDEX, len(g))] += 1e-6
+    bend = _FIRST_ILLUMINATION_INDEX + TONE_CURVE_BEND
+    N[_BLUR_VARIANCE_INDEX, _BLUR_VARIANCE_INDEX] += 1.0  # limits the step to about a node's width
+    N[bend, bend] += (_TONE_CURVE_BEND_PRIOR_SIGMA * contrast_grey) ** -2.0
+    g[bend] -= (
+        illumination[TONE_CURVE_BEND] * (_TONE_CURVE_BEND_PRIOR_SIGMA * contrast_grey) ** -2.0
+    )
+    N[range(_FIRST_ILLUMINATION_INDEX, len(g)), range(_FIRST_ILLUMINATION_INDEX, len(g))] += 1e-6
     N[range(8), range(8)] += _HOMOGRAPHY_INCREMENT_PRIOR_INFORMATION
-    g[_SHAPE_SLICE] -= _HOMOGRAPHY_INCREMENT_PRIOR_INFORMATION * homography_increment_from_start
+    g[_HOMOGRAPHY_SLICE] -= (
+        _HOMOGRAPHY_INCREMENT_PRIOR_INFORMATION * homography_increment_from_start
+    )
     return _NormalEquations(contrast_grey, grey_residual, J, noise, N, g)
 
 
 # --- How well the image matches a fitted drawing ---
 
 
-def fit_correlation(grey: Array, grey_residual: Array) -> float:
+def correlation_from_residual(grey: Array, grey_residual: Array) -> float:
     """Return the correlation of grey values (k,) with their fitted values: the square root of the
     explained fraction of their variance, 0 if none is explained. `grey_residual` (k,) is the
     difference between the two."""
@@ -414,18 +429,18 @@ def _assign_nodes_to_cells(
 # edges.
 
 
-def _illuminated_jacobian(drawing: RenderedDrawing, illumination: Array) -> Array:
+def _grey_jacobian_under_illumination(drawing: RenderedDrawing, illumination: Array) -> Array:
     """Return the derivatives (9, n * n) of the drawing's grey values at the nodes with respect to
     the increment of the homography (8) and the variance of the blur (1), in squared node spacings.
     `illumination` (7 or 8,) contains the coefficients of the illumination, which converts the
     drawing to grey values, one per row of `RenderedDrawing.illumination_basis`."""
     contrast_grey, (u, v, _) = float(illumination[GAIN]), drawing.grid.node_uv1
     (white, changes), *others = drawing.blurred_whiteness_and_off_paper_fraction
-    bend = min(max(float(illumination[BEND]) / contrast_grey, -0.9), 0.9)
+    bend = min(max(float(illumination[TONE_CURVE_BEND]) / contrast_grey, -0.9), 0.9)
     slope = contrast_grey + illumination[GAIN_U] * u + illumination[GAIN_V] * v
     slope = slope * (1.0 + bend * (1.0 - 2.0 * white))
     change: Array = changes * slope
-    for (_, more), height in zip(others, illumination[BEYOND:], strict=True):
+    for (_, more), height in zip(others, illumination[OFF_PAPER_GREY:], strict=True):
         change += more * height
     return change
 
@@ -456,11 +471,11 @@ def make_sampling_grid(nodes_per_side: int, grid_reach_half_sides: float) -> Sam
         (2.0 * np.arange(nodes_per_side) + 1.0) / nodes_per_side - 1.0
     )
     return SamplingGrid(
-        nodes_per_side, node_positions_half_sides, _grid_coordinates(node_positions_half_sides)
+        nodes_per_side, node_positions_half_sides, _make_node_uv1(node_positions_half_sides)
     )
 
 
-def _grid_coordinates(node_positions_half_sides: Array) -> Array:
+def _make_node_uv1(node_positions_half_sides: Array) -> Array:
     """Return the homogeneous coordinates (u, v, 1) of all nodes, row by row, (3, n * n), of a grid
     with `node_positions_half_sides` (n,) along both axes."""
     u, v = np.meshgrid(node_positions_half_sides, node_positions_half_sides)
@@ -507,7 +522,7 @@ def _make_chebyshev_nodes(grid: SamplingGrid) -> tuple[Array, Array]:
     x = chebyshev.chebpts2(_CHEBYSHEV_NODES_PER_AXIS)
     degree = _CHEBYSHEV_NODES_PER_AXIS - 1
     through = np.linalg.inv(chebyshev.chebvander(x, degree))
-    return _grid_coordinates(reach * x), chebyshev.chebvander(
+    return _make_node_uv1(reach * x), chebyshev.chebvander(
         grid.node_positions_half_sides / reach, degree
     ) @ through
 
@@ -575,7 +590,7 @@ def gram_matrix(rows: Array) -> Array:
 _LOG_BLUR_TABLE_STEP = 0.02  # Relative step between the blurs in the table.
 # Rows of the illumination basis: offset and its slopes, gain and its slopes, bend of the tone
 # curve, grey beyond the sheet.
-OFFSET, OFFSET_U, OFFSET_V, GAIN, GAIN_U, GAIN_V, BEND, BEYOND = range(8)
+OFFSET, OFFSET_U, OFFSET_V, GAIN, GAIN_U, GAIN_V, TONE_CURVE_BEND, OFF_PAPER_GREY = range(8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -595,12 +610,12 @@ class RenderedDrawing:
         returned as a pair: its values (n * n,) at the nodes, and their derivatives (9, n * n) with
         respect to the increment of the homography (8) and the variance of the blur, in squared node
         spacings."""
-        sharp_nodes = render_whiteness_and_off_paper_fraction(
+        sharp_node_values = render_whiteness_and_off_paper_fraction(
             self.drawing, self.grid.nodes_per_side
         )
         return tuple(
             _blur_with_jacobian(each, self.blur_sigma_nodes, self.grid.node_positions_half_sides)
-            for each in sharp_nodes
+            for each in sharp_node_values
         )
 
     @cached_property
@@ -621,7 +636,7 @@ class RenderedDrawing:
         """Illumination basis for a plain black square in place of the marker, without the slopes of
         the gain and without the bend of the tone curve: the rows (4 or 5, n * n), and their Gram
         matrix."""
-        soft = blur_nodes(
+        soft = blur_node_values(
             render_black_square(len(self.drawing.cell_whiteness), self.grid.nodes_per_side),
             self.blur_sigma_nodes,
         )
@@ -629,7 +644,7 @@ class RenderedDrawing:
             BLUR_MARGIN_NODES:-BLUR_MARGIN_NODES, BLUR_MARGIN_NODES:-BLUR_MARGIN_NODES
         ].reshape(1, -1)
         lit, _ = self.illumination_basis
-        rows = np.concatenate([lit[:GAIN], black, lit[BEYOND:]])
+        rows = np.concatenate([lit[:GAIN], black, lit[OFF_PAPER_GREY:]])
         return rows, gram_matrix(rows)
 
     @cached_property
@@ -657,9 +672,11 @@ def render_blurred(
 
 
 def _blur_with_jacobian(
-    sharp_nodes: NDArray[np.float32], blur_sigma_nodes: float, node_positions_half_sides: Array
+    sharp_node_values: NDArray[np.float32],
+    blur_sigma_nodes: float,
+    node_positions_half_sides: Array,
 ) -> tuple[Array, Array]:
-    soft = blur_nodes(sharp_nodes, blur_sigma_nodes)
+    soft = blur_node_values(sharp_node_values, blur_sigma_nodes)
     step = float(node_positions_half_sides[1] - node_positions_half_sides[0])
     e, n = BLUR_MARGIN_NODES, len(node_positions_half_sides)
     middle = slice(e, e + n)

@@ -24,7 +24,7 @@ from perchctl.geometry import Array
 from perchctl.vision.markers.corners import is_inside_image, mean_side_px, scale_square
 from perchctl.vision.markers.detector import (
     MIRRORED_MARKER_ID,
-    OPENCV_THRESHOLD_WINDOWS_PX,
+    OPENCV_DEFAULT_THRESHOLD_WINDOWS_PX,
     QUICK_THRESHOLD_WINDOWS_PX,
     DetectorInput,
     ThresholdWindowRange,
@@ -41,7 +41,7 @@ with OpenCV, "expected_fits" fits a blurred target at that position, and "near_e
 "whole_sharp" searches the whole image with OpenCV, which needs a sharp target, and "whole_blurred"
 searches it for a blurred target. "all" combines all of these."""
 _WINDOW_MARGIN_TO_TARGET_SIZE_RATIO = 0.25
-_SEARCH_WINDOW_MARGIN_PX = 24
+_MIN_SEARCH_WINDOW_MARGIN_PX = 24
 _MIN_SEARCH_WINDOW_SIDE_PX = 16
 _MAX_WINDOW_TO_IMAGE_AREA_RATIO = 0.8
 _MIN_MARKER_SIDE_TO_HALVE_IMAGE_PX = 60.0
@@ -65,7 +65,7 @@ class FoundMarkers:
     target_count: int = 0
 
 
-def search(
+def search_for_markers(
     detector_input: DetectorInput,
     expected_corners_px: Mapping[MarkerName, Array],
     search_mode: SearchMode = "all",
@@ -80,11 +80,11 @@ def search(
     the search returns the one closest to this vehicle's own target
     (`measure_marker_to_own_target_distance_m`).
     """
-    setup, shape = detector_input.setup, detector_input.image.shape
-    whole = slice(0, shape[0]), slice(0, shape[1])
+    setup, image_shape = detector_input.setup, detector_input.image.shape
+    whole = slice(0, image_shape[0]), slice(0, image_shape[1])
 
     def search_part(part: ImageWindow, threshold_windows_px: ThresholdWindowRange) -> FoundMarkers:
-        return _search_once(
+        return _search_window(
             detector_input,
             part,
             expected_corners_px,
@@ -99,18 +99,19 @@ def search(
         if quickly is not None:
             return quickly
         window = (
-            make_search_window(expected_corners_px, setup.small_to_large_side_ratio, shape) or whole
+            make_search_window(expected_corners_px, setup.small_to_large_side_ratio, image_shape)
+            or whole
         )
         found = FoundMarkers()
         if len(expected_corners_px) == 2:
             found = search_part(window, QUICK_THRESHOLD_WINDOWS_PX)
         if len(found.corners_px) < 2 and window != whole:
-            found = search_part(window, OPENCV_THRESHOLD_WINDOWS_PX)
+            found = search_part(window, OPENCV_DEFAULT_THRESHOLD_WINDOWS_PX)
         if len(found.corners_px) >= (2 if window == whole else 1) or (
             search_mode in ("near_expected", "expected_window") and window != whole
         ):
             return found
-    return search_part(whole, OPENCV_THRESHOLD_WINDOWS_PX)
+    return search_part(whole, OPENCV_DEFAULT_THRESHOLD_WINDOWS_PX)
 
 
 def search_half_size_image(
@@ -120,12 +121,12 @@ def search_half_size_image(
 ) -> FoundMarkers | None:
     """Search the window around the expected markers in an image of half the size, which takes 1 ms.
     The corners returned are in pixels of the full-size image. The arguments are those of
-    `search`. Return None if this search misses a marker that is expected to be
+    `search_for_markers`. Return None if this search misses a marker that is expected to be
     completely in view, if fewer than two markers are expected, if none of them is expected to be
     completely in view, or if the sides of one that is are not longer than
     `_MIN_MARKER_SIDE_TO_HALVE_IMAGE_PX`."""
-    shape = detector_input.image.shape
-    in_view = [quad for quad in expected_corners_px.values() if is_inside_image(quad, shape)]
+    image_shape = detector_input.image.shape
+    in_view = [quad for quad in expected_corners_px.values() if is_inside_image(quad, image_shape)]
     if (
         len(expected_corners_px) < 2
         or not in_view
@@ -133,10 +134,10 @@ def search_half_size_image(
     ):
         return None
     window = make_search_window(
-        expected_corners_px, detector_input.setup.small_to_large_side_ratio, shape
+        expected_corners_px, detector_input.setup.small_to_large_side_ratio, image_shape
     )
-    window = window or (slice(0, shape[0]), slice(0, shape[1]))
-    found = _search_once(
+    window = window or (slice(0, image_shape[0]), slice(0, image_shape[1]))
+    found = _search_window(
         detector_input,
         window,
         expected_corners_px,
@@ -150,14 +151,14 @@ def search_half_size_image(
 def make_search_window(
     expected_corners_px: Mapping[MarkerName, Array],
     small_to_large_side_ratio: float,
-    shape: tuple[int, ...],
+    image_shape: tuple[int, ...],
 ) -> ImageWindow | None:
-    """Return the part of an image with the given `shape` (h, w) to search for the expected
+    """Return the part of an image with the given `image_shape` (h, w) to search for the expected
     markers. If it is nearly the whole image or too narrow, return None; the caller then searches
     the whole image. The window contains the complete large marker if it may be completely in the
     image. `small_to_large_side_ratio` is the side of the small marker divided by the side of the
     large one."""
-    h, w = shape[:2]
+    h, w = image_shape[:2]
     if "large" in expected_corners_px:
         corners = expected_corners_px["large"]
     else:
@@ -168,7 +169,7 @@ def make_search_window(
         corners = whole if inside else centre + 1.6 * (small - centre)
     low, high = corners.min(axis=0), corners.max(axis=0)
     margin = np.maximum(
-        _WINDOW_MARGIN_TO_TARGET_SIZE_RATIO * (high - low).max(), _SEARCH_WINDOW_MARGIN_PX
+        _WINDOW_MARGIN_TO_TARGET_SIZE_RATIO * (high - low).max(), _MIN_SEARCH_WINDOW_MARGIN_PX
     )
     left, top = np.clip(np.floor(low - margin), 0, (w, h)).astype(int)
     right, bottom = np.clip(np.ceil(high + margin), 0, (w, h)).astype(int)
@@ -181,7 +182,7 @@ def make_search_window(
     return slice(int(top), int(bottom)), slice(int(left), int(right))
 
 
-def _search_once(
+def _search_window(
     detector_input: DetectorInput,
     window: ImageWindow,
     expected_corners_px: Mapping[MarkerName, Array],
@@ -239,8 +240,12 @@ def choose_markers(
         )
     large, small = candidates["large"], candidates["small"]
     wholes = _pair_markers(candidates, small_to_large_side_ratio)
-    near_large = _nearest_candidate("large", large, expected_corners_px, small_to_large_side_ratio)
-    near_small = _nearest_candidate("small", small, expected_corners_px, small_to_large_side_ratio)
+    near_large = _find_candidate_near_expected(
+        "large", large, expected_corners_px, small_to_large_side_ratio
+    )
+    near_small = _find_candidate_near_expected(
+        "small", small, expected_corners_px, small_to_large_side_ratio
+    )
     if wholes:
         _, i, j = wholes[0]
         if expected_corners_px:
@@ -252,7 +257,9 @@ def choose_markers(
         elif measure_marker_to_own_target_distance_m is not None:
             _, i, j = min(wholes, key=lambda whole: whole[1])
         elsewhere = (
-            _nearest_candidate("large", [large[i]], expected_corners_px, small_to_large_side_ratio)
+            _find_candidate_near_expected(
+                "large", [large[i]], expected_corners_px, small_to_large_side_ratio
+            )
             is None
         )
         if not (elsewhere and (near_large is not None or near_small is not None)):
@@ -326,7 +333,7 @@ def nesting_error_to_tolerance_ratio(
     return float(np.linalg.norm(mapped - small_corners_px, axis=1).max()) / allowed_px
 
 
-def _nearest_candidate(
+def _find_candidate_near_expected(
     name: MarkerName,
     quads: list[Array],
     expected_corners_px: Mapping[MarkerName, Array],

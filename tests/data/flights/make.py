@@ -162,7 +162,9 @@ def _keep_pictures(recording: Path, path: Path) -> None:
     for about, picture in islice(recorded_frames(recording), PICTURES):
         data = None if picture is None else _packed(picture.data)
         number, t_s, arrival_s = about["number"], about["t_s"], about["t_arrival_s"]
-        kept.write_frame(Frame(number, t_s, image, arrival_s, repeated=data is None, encoded=data))
+        kept.write_frame(
+            Frame(number, t_s, image, arrival_s, is_repeated=data is None, source_jpeg=data)
+        )
     kept.close()
 
 

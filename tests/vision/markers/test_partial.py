@@ -34,7 +34,7 @@ from perchctl.vision.markers.partial import (
     find_visible_edges,
     fit_partly_visible_marker,
 )
-from perchctl.vision.markers.search import search
+from perchctl.vision.markers.search import search_for_markers
 from perchctl.vision.types import Detections, MarkerName
 from tests.helpers.markers import POSE, SETUP, corners, followed, frame, waved
 from tests.helpers.target_picture import CAMERA, pose_of, render
@@ -138,7 +138,7 @@ def test_what_the_edge_cut_off_is_not_taken_unless_its_cells_are_seen() -> None:
     """Both markers decoded, but the large one does not look as it should."""
     pose = cut(0.03, 0)
     image = render(*pose, noise=2.0)
-    assert set(search(DetectorInput(image, None, SETUP, CAMERA), {}).corners_px) == {
+    assert set(search_for_markers(DetectorInput(image, None, SETUP, CAMERA), {}).corners_px) == {
         "large",
         "small",
     }

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.vision import CameraModel, project, square_corners
 from perchctl.vision.markers.blurred import (
-    excludes_other_codewords,
-    find_blurred,
-    find_expected_blurred,
+    are_other_codewords_excluded,
+    find_blurred_marker,
+    find_expected_blurred_marker,
     is_alignment_confirmed,
 )
 from perchctl.vision.markers.detect import detect_markers
@@ -180,7 +180,9 @@ def picture(
 def test_the_marker_itself_is_told_apart(
     cell_size_px: float, blurs: float, noise: float, seed: int
 ) -> None:
-    assert excludes_other_codewords(seen(CELLS, cell_size_px, blurs * cell_size_px, noise, seed))
+    assert are_other_codewords_excluded(
+        seen(CELLS, cell_size_px, blurs * cell_size_px, noise, seed)
+    )
 
 
 @pytest.mark.parametrize(
@@ -214,7 +216,7 @@ def test_blur_that_hides_the_target_from_the_plain_detector(seed: int) -> None:
     image, true = blurry(26.0, 3.0, seed)
     ids = ARUCO.detectMarkers(image)[1]
     assert ids is None or 997 not in ids
-    still = find_blurred(DetectorInput(image, None, SETUP, CAMERA))
+    still = find_blurred_marker(DetectorInput(image, None, SETUP, CAMERA))
     assert np.abs(still["large"].corners_px - true).max() < 0.5
     found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert found.large is not None
@@ -224,7 +226,9 @@ def test_blur_that_hides_the_target_from_the_plain_detector(seed: int) -> None:
 def test_in_blur_the_target_is_found_beside_where_it_is_expected(seed: int) -> None:
     image, true = blurry(24.0, 3.0, seed)
     way = np.random.default_rng(seed).uniform(-8.0, 8.0, 2)
-    seen = find_expected_blurred(DetectorInput(image, None, SETUP, CAMERA), {"large": true + way})
+    seen = find_expected_blurred_marker(
+        DetectorInput(image, None, SETUP, CAMERA), {"large": true + way}
+    )
     assert np.abs(seen["large"].corners_px - true).max() < 0.5
     before = Detections(0, 0.0, Detection("large", true + way, 0.1, True))
     found = detect_markers(frame(image, 1), before, SETUP, CAMERA)
@@ -242,5 +246,7 @@ def test_in_blur_nothing_is_taken_for_the_target() -> None:
             image[y : y + side, x : x + side] = 30
             image[y + side // 5 : y + 4 * side // 5, x + side // 5 : x + 4 * side // 5] = 210
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.uint8)
-        assert find_blurred(DetectorInput(image, None, SETUP, CAMERA)) == {}
-        assert find_expected_blurred(DetectorInput(image, None, SETUP, CAMERA), expected) == {}
+        assert find_blurred_marker(DetectorInput(image, None, SETUP, CAMERA)) == {}
+        assert (
+            find_expected_blurred_marker(DetectorInput(image, None, SETUP, CAMERA), expected) == {}
+        )
