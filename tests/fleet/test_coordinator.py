@@ -16,6 +16,8 @@ from perchctl.fleet.coordinator import HUNG_S, LOOP_HUNG_S, START_HUNG_S, Coordi
 from perchctl.fleet.messages import BEAT_S, Order, Result, Stage, Status, VehicleOutcome
 from perchctl.flight import OperatorSwitch
 from perchctl.mission import OperatorRequest, Phase
+from perchctl.mission.phases.align import MAX_WAIT_FOR_CLIMB_PERMISSION_S
+from perchctl.profile import load_profile
 from tests.fleet.rig import fleet
 
 FAR: tuple[tuple[Point, Point], ...] = tuple(((4.0 * n, 0.0), (4.0 * n, 0.5)) for n in range(4))
@@ -253,6 +255,13 @@ def test_one_far_away_flies_on_unless_a_failure_lands_all() -> None:
 
 
 # --- Permission to climb ---
+
+
+def test_a_climb_waits_longer_than_a_neighbour_of_unknown_position_can_block_it() -> None:
+    """Seed 2612110109: a neighbour whose link fell silent while it landed counted as in the air for
+    38 s, and the vehicle that waited for it landed after 20."""
+    longest_landing_s = load_profile("sim").planner.landing.timeout_s
+    assert longest_landing_s + HUNG_S < MAX_WAIT_FOR_CLIMB_PERMISSION_S
 
 
 def test_a_climb_is_permitted_again_and_again_until_a_neighbour_is_near() -> None:

@@ -53,7 +53,7 @@ def test_without_permission_it_lands_in_the_end(x_m: float) -> None:
         return
     assert flown.state.transition_name == "climb-not-permitted"
     assert (flown.state.phase, flown.state.outcome) == (Phase.LANDING, Outcome.SAFETY)
-    assert flown.state.transition_reason == f"no permission to climb for 20 s: {WHY}"
+    assert flown.state.transition_reason == f"no permission to climb for 45 s: {WHY}"
     assert flown.ticks[-1].t_s == pytest.approx(BEGIN_S + MAX_WAIT_FOR_CLIMB_PERMISSION_S, abs=0.1)
     waiting = flown.ticks[-2].state
     assert waiting.pause_reason == f"waiting for permission to climb: {WHY}"

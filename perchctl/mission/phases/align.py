@@ -24,11 +24,12 @@ from perchctl.mission.setpoints import (
 )
 from perchctl.mission.transition import Transition, back_off_row, land_row
 
-MAX_WAIT_FOR_CLIMB_PERMISSION_S = 20.0
+MAX_WAIT_FOR_CLIMB_PERMISSION_S = 45.0
 """Longest wait for permission to climb, s, from the entry into the phase or the end of a hold;
 `planner.perching_time_s` limits the total. Larger: the battery of a vehicle without permission runs
-down. Smaller: this flight also ends if a neighbour blocks the climb only briefly, while the
-neighbour lands or until the parent process has ended the neighbour's unresponsive process."""
+down. Smaller: this flight also ends if a neighbour blocks the climb only for a limited time. The
+longest such time is that of a neighbour whose link is silent while it lands: up to the time limit
+of its landing (30 s by default), and 10 s more until it is certainly down."""
 
 ALIGNED = Condition[Context](
     "aligned",
