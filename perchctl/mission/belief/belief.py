@@ -49,8 +49,8 @@ the vehicle seems to ignore the commanded thrust."""
 
 @dataclass(frozen=True)
 class GearToTargetDistance:
-    """Horizontal distance between the gear and the target's axis at a touch, m, and its standard
-    deviation, m, which is infinite if unknown."""
+    """Horizontal distance between the gear and the target's axis, m, and its standard deviation, m,
+    which is infinite if the distance is unknown."""
 
     distance_xy_m: float
     sigma_m: float
@@ -72,8 +72,8 @@ class Belief:
     """The belief about vehicle and target, together with the evidence for it: reliability of the
     state estimate, dead reckoning, target, contact, hover thrust and battery.
 
-    Times are on the loop's clock. A time is None until the event has happened. Positions and
-    velocities are in the world frame of the state estimate.
+    Times are on the loop's clock. A time is None, or -inf, until the event has happened. Positions
+    and velocities are in the world frame of the state estimate.
     """
 
     obs: Observation  #: newest observation, on which all properties depend
@@ -101,8 +101,10 @@ class Belief:
 
     # --- motion, target and contact ---
     dead_reckoning: DeadReckoning = field(default_factory=DeadReckoning)
-    last_target_world_m: Array | None = None  #: target's world position in its last measured frame
-    target_position_scatter_m: float = 0.0  #: scatter of the target's position from frame to frame
+    #: target's position in world axes, m, in the last frame that measured it
+    last_target_world_m: Array | None = None
+    #: decaying maximum of the target's movement in the world between successive measured frames
+    target_position_scatter_m: float = 0.0
     #: vehicle's velocity from pictures alone
     visual_motion: VisualMotion = field(default_factory=VisualMotion)
     #: Kalman filter of the lateral offset from the target
@@ -278,7 +280,8 @@ class Belief:
     @cached_property
     def is_estimate_missing_gust(self) -> bool:
         """True after an impact or gust that only the accelerometer has measured, until a sighting
-        corrects the estimate. The firmware's estimator ignores lateral forces."""
+        corrects the estimate. The firmware's estimator ignores lateral forces. Always False if the
+        positions come from a deck or motion capture."""
         is_reckoned = self.dead_reckoning.imu_at_last_update is not None
         if not (
             self.is_target_position_source
@@ -333,9 +336,9 @@ class Belief:
     def can_descend_under_position_control(self) -> bool:
         """True if the vehicle can descend under position control, using a position from any source
         (deck, motion capture or target): positions have not diverged, dead reckoning has not
-        replaced them, and the heading is not lost (unless the telemetry is too old for the
-        alternative, raw thrust). With the target as the source,
-        `can_descend_with_target_as_position_source` must hold as well."""
+        replaced them, and the heading is not lost. With a deck or motion capture, a lost heading is
+        accepted if the telemetry is too old for the alternative, a descent by raw thrust. With the
+        target as the source, `can_descend_with_target_as_position_source` must be true as well."""
         lost = self.is_position_diverged or self.dead_reckoning_began_at_s is not None
         if lost or (
             self.is_target_position_source and not self.can_descend_with_target_as_position_source
@@ -496,8 +499,9 @@ class Belief:
 
     @property
     def is_possibly_in_magnet_reach(self) -> bool:
-        """True if the magnet may be holding the vehicle: after a contact, or once dead reckoning
-        places the gear within the magnet's reach."""
+        """True if the magnet may be holding the vehicle: a contact is recorded
+        (`vehicle_world_z_at_last_contact_m`), or dead reckoning has placed the gear within the
+        magnet's reach (`magnet_reach_entered_at_s`)."""
         return (
             self.vehicle_world_z_at_last_contact_m is not None
             or self.magnet_reach_entered_at_s is not None

@@ -133,10 +133,12 @@ HANGING_CONFIRMATION_DWELL_S = 1.0
 
 
 def current_gear_to_target(b: Belief) -> GearToTargetDistance:
-    """Return the distance between the gear and the target's axis, with its standard deviation:
-    during a contact, from the newest image if that is more precise, otherwise by dead reckoning
-    from the last sighting. With decks, the standard deviation then grows, because the estimated
-    position drifts and the impact on the ceiling disturbs it."""
+    """Return the present distance between the gear and the target's axis, with its standard
+    deviation. It comes from the newest image if that was exposed during the present contact, or
+    just before it, and is at least as precise as dead reckoning from the last sighting, otherwise
+    from dead reckoning. With a deck as the position source, the standard deviation of the
+    dead-reckoned distance grows with the age of the sighting, because the estimated position drifts
+    and the impact on the ceiling disturbs it."""
     reckoned, seen = _dead_reckoned_gear_to_target(b), _gear_to_target_seen_in_contact(b)
     return reckoned if seen is None or reckoned.sigma_m < seen.sigma_m else seen
 
@@ -214,7 +216,9 @@ def gear_to_target_at_last_touch(b: Belief) -> GearToTargetDistance | None:
 
 
 def gear_to_target_at_last_touch_or_now(b: Belief) -> GearToTargetDistance:
-    """Return the distance at the last touch while it is valid, otherwise the current distance."""
+    """Return the gear's distance from the target's axis at the last touch, while the vehicle
+    retreats from an attempt (`gear_to_target_at_last_touch`), otherwise the present distance
+    (`current_gear_to_target`)."""
     return gear_to_target_at_last_touch(b) or current_gear_to_target(b)
 
 
@@ -259,9 +263,11 @@ def max_press_thrust(profile: Profile) -> float:
 
 
 def is_flying_at_hover_thrust(b: Belief) -> bool:
-    """True if the present thrust is hover thrust: speed, climb rate and specific force are within
-    `MAX_HOVER_SPEED_MPS`, `MAX_HOVER_CLIMB_RATE_MPS` and `MAX_SPECIFIC_FORCE_DEVIATION_IN_HOVER_G`
-    of those in hover, and nothing blocks a climb."""
+    """True if the vehicle flies so quietly that its present thrust is hover thrust: speed, climb
+    rate and specific force are within `MAX_HOVER_SPEED_MPS`, `MAX_HOVER_CLIMB_RATE_MPS` and
+    `MAX_SPECIFIC_FORCE_DEVIATION_IN_HOVER_G` of those in hover, the motors are neither off nor
+    saturated, and nothing blocks a climb. False without fresh telemetry or a valid position. The
+    thrust is not compared with the estimated hover thrust."""
     tel, setpoint = b.telemetry, b.command_history.setpoint
     vz = tel.velocity_mps[2]
     stuck = (
@@ -283,7 +289,8 @@ def is_flying_at_hover_thrust(b: Belief) -> bool:
 
 
 def is_thrust_too_low_to_fly(b: Belief) -> bool:
-    """True if the thrust is too small to support the vehicle.
+    """True if the reported thrust is too small to support the vehicle; False if it is unreliable or
+    hover thrust is unknown.
 
     The limit is `complete.hold_ratio` times hover thrust. Position mode never commands less than
     `MIN_FIRMWARE_POSITION_MODE_THRUST`, so that value is the limit if it is larger and still too
@@ -296,9 +303,10 @@ def is_thrust_too_low_to_fly(b: Belief) -> bool:
 
 
 def is_thrust_above_hover(b: Belief) -> bool:
-    """True if the thrust is at least `MIN_PRESS_TO_HOVER_THRUST_RATIO` times hover thrust. If the
-    vehicle cannot produce that much, a thrust close to the largest possible one is enough: close to
-    the commanded thrust during a press by raw thrust, otherwise close to full thrust."""
+    """True if the reported thrust is at least `MIN_PRESS_TO_HOVER_THRUST_RATIO` times hover thrust.
+    If the vehicle cannot produce that much, or hover thrust is unknown, a thrust close to the
+    largest possible one is enough: close to `max_press_thrust` during a press by raw thrust,
+    otherwise close to full thrust."""
     most = MIN_SATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
     if (
         b.command_history.maneuver.presses_against_target
@@ -342,18 +350,22 @@ def is_slipping(b: Belief) -> bool:
 
 
 def is_vertically_motionless(b: Belief) -> bool:
-    """True if the vehicle is supported and does not move vertically: the accelerometer reads 1 g
-    and, if the position is valid, the vertical speed is almost zero."""
+    """True if the vehicle does not move vertically, as in hover or on a support: the accelerometer
+    reads 1 g and, if the position is valid, the vertical speed is less than
+    `MAX_MOTIONLESS_CLIMB_RATE_MPS`. Without a valid position, a constant climb rate also counts."""
     return b.is_accelerometer_reading_one_g and (
         abs(b.telemetry.velocity_mps[2]) < MAX_MOTIONLESS_CLIMB_RATE_MPS or not b.is_position_valid
     )
 
 
 def _is_in_contact_with_target(b: Belief) -> bool:
-    """True if position, acceleration and thrust together show a contact.
+    """True if position, acceleration and thrust together show that the gear is pressed against the
+    target.
 
-    The gear has stopped at the target's height, the accelerometer reads 1 g, and the thrust exceeds
-    hover thrust, so the ceiling must be pushing back.
+    The gear has stopped within `perch.contact_z_m` of the target's height, the accelerometer reads
+    1 g, and the thrust exceeds hover thrust, so the ceiling must be pushing back. With the target
+    as the only position source, the tolerance in height grows with the age of the last sighting.
+    The lateral distance from the target is not checked.
     """
     perch, tel = b.profile.planner.perch, b.telemetry
     steady = abs(tel.velocity_mps[2]) <= MAX_MOTIONLESS_CLIMB_RATE_MPS and b.is_position_valid
@@ -469,8 +481,10 @@ def _is_on_floor(b: Belief) -> bool:
 
 
 def _is_pressing_against_obstacle(b: Belief) -> bool:
-    """True if the vehicle is pressing against an obstacle: the setpoint is above the vehicle, the
-    thrust exceeds hover thrust or is at its limit, and the vehicle does not move."""
+    """True if something blocks the vehicle's climb: the setpoint is above the vehicle, the thrust
+    exceeds hover thrust, the vehicle is above `MIN_HEIGHT_OF_BLOCKED_CLIMB_M`, and it does not move
+    vertically. False for a vehicle so heavy that too little thrust remains to prove a press
+    (`MAX_HOVER_TO_FULL_THRUST_RATIO_TO_DETECT_PRESS`). The target also counts as an obstacle."""
     setpoint, tel = b.command_history.setpoint, b.telemetry
     if (
         setpoint is None
@@ -606,16 +620,21 @@ class Support(Enum):
 
 
 def find_support(b: Belief) -> Support:
-    """Return what supports the vehicle, from the conditions that are true in this tick.
+    """Return what supports the vehicle. The first condition that is true in this tick decides:
 
-    The result is MAGNET only if the gear is certainly within the magnet's radius. It is
-    HELD_BY_OTHER_OBJECT only if the gear is certainly outside that radius or certainly below the
-    target. (The gear cannot be above the target, because the ceiling is there: such an estimate is
-    wrong and proves nothing.) In all other cases, the support is UNKNOWN, and a row of the
-    transition table must assume the more dangerous of the possible supports.
+    - `HANGING`: MAGNET if the gear was within the magnet's radius (`perch.contact_xy_m`) at the
+      last touch, or certainly is now, at the target's height. HELD_BY_OTHER_OBJECT if the gear is
+      certainly outside that radius, or below the target by more than `contact_height_tolerance_m`.
+      (The gear cannot be above the target, because the ceiling is there: such an estimate is wrong
+      and proves nothing.) UNKNOWN otherwise.
+    - `ON_FLOOR`: FLOOR.
+    - `TARGET_CONTACT` or `CLIMB_BLOCKED`: PRESSED_SURFACE.
+    - None of these: AIR if the vehicle moves as in hover (`is_flying_at_hover_thrust`) and its
+      thrust is neither too low to fly nor above hover thrust; UNKNOWN otherwise, for example while
+      the vehicle accelerates or its position is unknown.
 
-    The support is also UNKNOWN while thrust or position is unknown, while the vehicle accelerates,
-    and in the first tick of a maneuver.
+    If the result is UNKNOWN, a row of the transition table must assume the more dangerous of the
+    possible supports.
     """
     if HANGING in b.condition_start_times_s:
         return _find_what_vehicle_hangs_on(b)
@@ -670,8 +689,9 @@ def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
 
 def has_slipped(b: Belief) -> bool:
     """True if the vehicle has slipped off its contact: `is_slipping` has been true for
-    `complete.slip_dwell_s`. Once the weight transfer by raw thrust has begun, the first sign of
-    free fall is enough."""
+    `complete.slip_dwell_s`. Once the weight transfer by raw thrust has begun, one tick is enough in
+    which fresh telemetry shows a specific force below `complete.slip_acc_g` and a climb rate below
+    `MAX_CLIMB_RATE_IF_FALLING_IN_WEIGHT_TRANSFER_MPS`."""
     tel, complete = b.telemetry, b.profile.planner.complete
     falls = (
         b.command_history.weight_transfer_began_at_s is not None

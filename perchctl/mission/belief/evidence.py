@@ -55,8 +55,9 @@ def update_condition_start_times(
     condition_input: ConditionInput,
     now_s: float,
 ) -> dict[Condition[ConditionInput], float]:
-    """Return the start time of each condition that is true for `condition_input`: the time in `old`
-    if the condition was true before, otherwise `now_s`. Conditions that are false are omitted."""
+    """Return the start time, s, of each of `conditions` whose predicate is true for
+    `condition_input`: the time in `old` if the condition was true before, otherwise `now_s`. All
+    other conditions, also those of `old`, are omitted."""
     return {each: old.get(each, now_s) for each in conditions if each.predicate(condition_input)}
 
 

@@ -89,14 +89,14 @@ def filter_rotor_thrust(b: Belief, dt_s: float) -> float:
 
 
 def learn_hover_thrust_in_quiet_flight(b: Belief, dt_s: float) -> HoverThrust:
-    """Return the estimate after a tick of quiet flight, in which the reported thrust, 0..65535,
-    measures hover thrust. `dt_s` is the time since the previous telemetry sample, 0 if this tick
-    has no new sample.
+    """Return the estimated hover thrust after a tick of quiet flight, in which the reported thrust,
+    0..65535, measures hover thrust. `dt_s` is the time since the previous telemetry sample, 0 if
+    this tick has no new sample.
 
     The first estimate is the recent mean of thrust per measured g (`ImuMotion.mean_hover_thrust`)
-    or, if that is unknown, the reported thrust. Later, the estimate does not change in a tick whose
-    thrust differs from it by more than `MAX_THRUST_DEVIATION_FRACTION_TO_LEARN_HOVER`, because the
-    ceiling or a hand then holds the vehicle.
+    or, if that is 0 (unknown), the reported thrust. Later, the estimate does not change in a tick
+    whose thrust differs from it by more than `MAX_THRUST_DEVIATION_FRACTION_TO_LEARN_HOVER`,
+    because the ceiling or a hand then holds the vehicle.
     """
     thrust, old = b.telemetry.thrust, b.hover_thrust_estimate
     if old.thrust == 0.0:

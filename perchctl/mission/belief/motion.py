@@ -165,13 +165,18 @@ class FusionAge:
 @dataclass(frozen=True)
 class Impact:
     """An impact on the vehicle from below, for example at a touchdown: its time (-inf if there was
-    none), the climb rates just before it (positive up), the largest specific force along the body's
-    z axis, g, and the height, world z."""
+    none), the vertical speeds just before it (m/s, positive up; one from the state estimate, one
+    integrated from the accelerometer), the largest specific force along the body's z axis (g), and
+    the estimated height, world z (m).
+
+    `ImpactDetector` also uses this class for single samples, any of which may prove to be the start
+    of an impact. The values are then those of the sample, and the height is not set.
+    """
 
     t_s: float = -math.inf  # -inf: no impact yet
     # vertical speed just before the impact, from the state estimate
     estimated_climb_before_impact_mps: float = 0.0
-    # vertical speed just before the impact, from `ImuMotion.velocity_mps`
+    # vertical speed just before the impact, from `ImuMotion.velocity_since_first_sample_world_mps`
     imu_climb_before_impact_mps: float = 0.0
     peak_acc_z_g: float = 0.0  # largest specific force during the impact along the body's z axis
     world_z_m: float = 0.0  # height in the state estimate at the impact
@@ -182,9 +187,10 @@ class Impact:
 
 @dataclass(frozen=True)
 class FreezeDetector:
-    """Detector of frozen readings: the times, s, for which the accelerometer, the attitude, and
-    position and velocity have not changed. In the air, two successive readings are never
-    identical."""
+    """Detector of frozen readings: three durations, s, for which the readings of the accelerometer,
+    of the attitude, and of position and velocity have been identical. In the air, two successive
+    readings are never identical, so a long duration means that the readings are out of date. The
+    durations of attitude and of position are -inf until that reading first changes."""
 
     # time for which the accelerometer readings have been identical
     acceleration_frozen_for_s: float = 0.0
@@ -287,21 +293,28 @@ class FallDetector:
 
 @dataclass(frozen=True)
 class ImpactDetector:
-    """Detector of impacts from below, for example at a touchdown. An impact adds more upward speed
-    in a short time than any thrust can. The peak force of an impact includes that of its
-    bounces."""
+    """Detector of impacts from below, for example at a touchdown.
+
+    An impact adds more upward speed in a short time than any thrust can: it is detected while
+    `upward_speed_gained_mps`, the integral of the vertical acceleration, which decays with
+    `IMPACT_DETECTOR_FORGETTING_TIME_CONSTANT_S` and is never negative, exceeds
+    `MIN_FLOOR_IMPACT_SPEED_GAIN_MPS`. The peak force of the newest impact includes that of its
+    bounces.
+    """
 
     upward_speed_gained_mps: float = 0.0
     last_impact_or_bounce_at_s: float = -math.inf
-    recent_samples: tuple[Impact, ...] = ()  # states just before an impact that begins now
+    # samples of the last `MAX_IMPACT_DETECTION_DELAY_S`, one of which may be the start of an impact
+    recent_samples: tuple[Impact, ...] = ()
     newest_impact: Impact = Impact()  # newest impact from below
 
     def update_impact(
         self, newest_sample: Impact, world_z_m: float, up_acceleration_mps2: float, dt_s: float
     ) -> Self:
         """Return the detector after `dt_s` of vertical acceleration `up_acceleration_mps2` (world
-        z, without gravity). `newest_sample` holds time, climb rates and specific force of the new
-        sample, and `world_z_m` is its estimated height."""
+        z, without gravity). `newest_sample` describes the sample at the end of that time as if an
+        impact began there: its time, its climb rates and its specific force, but no height.
+        `world_z_m` is the estimated height, world z, at that sample."""
         upward_speed_gained_mps = max(
             0.0,
             self.upward_speed_gained_mps
@@ -341,7 +354,7 @@ def _update_newest_impact(
     """Return the newest impact after one more sample.
 
     `newest_sample` holds the sample's time, its two climb rates (from the state estimate and from
-    the accelerometer) and its specific force along the body's z axis, but no height.
+    the accelerometer, m/s) and its specific force along the body's z axis (g), but no height.
     `recent_samples` holds such samples from the last `MAX_IMPACT_DETECTION_DELAY_S`, including
     `newest_sample`. `world_z_m` is the estimated height of the vehicle at the newest sample.
 
@@ -389,8 +402,10 @@ def _update_newest_impact(
 
 @dataclass(frozen=True)
 class SteadySpeedDetector:
-    """Loop times at which the vertical speed became constant, and at which the lateral velocity
-    came close to its mean."""
+    """Times from which the vertical speed, and the lateral velocity in world axes, have been
+    constant, and the values to which newer velocities are compared: the vertical speed at its start
+    time, and the low-passed lateral velocity. All velocities are integrated from the accelerometer.
+    Both times are inf before the first sample."""
 
     # time from which the vertical speed has been constant
     climb_rate_became_steady_at_s: float = math.inf
@@ -471,8 +486,12 @@ class ImuMotion(
     FreezeDetector, FallDetector, ImpactDetector, SteadySpeedDetector, LateralPushDetector
 ):
     """The vehicle's motion from accelerometer and attitude alone: velocity gained since the first
-    sample (world axes), falls, impacts, lateral pushes and telemetry gaps. A time of -inf means
-    that the event has not happened."""
+    sample (world axes), falls, impacts, lateral pushes and telemetry gaps.
+
+    A time of -inf means that an event has not happened yet. A time of inf means that a state has
+    not begun: the motors are turning, the accelerometer reads more than in free fall, or there is
+    no sample yet from which a speed could be constant.
+    """
 
     t_s: float = -math.inf  # time of the newest sample
     # velocity gained since the first sample, world axes
@@ -495,8 +514,10 @@ class ImuMotion(
     motors_stopped_at_s: float = math.inf
 
     def with_sample(self, last: Telemetry | None, new: Telemetry) -> ImuMotion:
-        """Return the motion after one more sample; `last` is the previous sample, None at the
-        first."""
+        """Return the motion after the sample `new`. `last` is the previous sample, None at the
+        first. If the samples are more than `MAX_TELEMETRY_GAP_S` apart, or the accelerometer has
+        been frozen for more than `MAX_FROZEN_READING_DURATION_S`, the detectors restart instead,
+        and the velocity does not change."""
         dt_s = math.inf if last is None else new.t_s - last.t_s
         started_anew = last is not None and new.start != last.start
         motion = replace(
@@ -567,9 +588,10 @@ class ImuMotion(
 
 
 def _restart_after_gap(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
-    """Return the motion after its first sample, or after a gap in the telemetry. The detectors
-    restart, and the learned offsets of the accelerometer are kept. The motion records the end of
-    the gap, and whether the vehicle may have fallen during it."""
+    """Return the motion at the sample `new`, the first sample ever (`last` is None) or the first
+    one after a gap in the telemetry. The detectors restart; the velocity and the learned offsets of
+    the accelerometer are kept. After a gap, the motion records its end, and whether the vehicle may
+    have fallen during it."""
     motion = replace(
         motion,
         climb_rate_became_steady_at_s=new.t_s,
@@ -604,6 +626,9 @@ def _restart_after_gap(motion: ImuMotion, last: Telemetry | None, new: Telemetry
 
 
 def _can_exclude_fall(last: Telemetry, new: Telemetry, height_change_in_gap_m: float) -> bool:
+    """True if the state estimate shows that the vehicle did not fall in the gap between the samples
+    `last` and `new`. `height_change_in_gap_m` is the total change of the estimated height over
+    successive gaps, at most 0."""
     dt_s = new.t_s - last.t_s
     gained_mps = new.velocity_mps[2] - last.velocity_mps[2]
     unexplained_m = new.position_m[2] - last.position_m[2] - last.velocity_mps[2] * dt_s

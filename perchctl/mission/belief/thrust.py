@@ -66,9 +66,10 @@ class HoverThrust:
         )
 
     def propagate_without_measurement(self, dt_s: float) -> HoverThrust:
-        """Return the estimate `dt_s` later without a measurement. Its standard deviation does not
-        grow beyond that of an estimate from the accelerometer, which is always available in
-        flight."""
+        """Return the estimate `dt_s` later without a measurement. Its standard deviation grows as
+        in quiet flight, but not beyond `HOVER_THRUST_BY_ACCELEROMETER_SIGMA_FRACTION`, because the
+        accelerometer always gives an estimate of that precision in flight. A larger standard
+        deviation does not change."""
         sigma = self.propagate(
             dt_s, HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_QUIET_FLIGHT
         ).sigma_fraction
