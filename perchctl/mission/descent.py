@@ -29,7 +29,7 @@ from perchctl.mission.belief.contact import (
     MOTORS_OFF_DESPITE_THRUST_COMMAND,
     MOTORS_OFF_DWELL_S,
     ON_FLOOR,
-    has_slipped,
+    has_slipped_off_contact,
     is_pressing,
 )
 from perchctl.mission.belief.maneuver import Maneuver
@@ -337,15 +337,15 @@ def has_descent_command_reached_minimum(c: Context) -> bool:
 
 def _has_fallen_off_magnet(c: Context) -> bool:
     """True if the vehicle has come off the magnet and is falling. During a weight transfer and
-    after the command to stop the motors, it must have slipped off its contact (`has_slipped`).
-    Before that, a contact must be recorded, no catch may be in progress, and the climb rate must be
-    below `MAX_CLIMB_RATE_WHEN_FALLING_OFF_MAGNET_MPS`; during the firmware's own landing, no fall
-    is detected. Always False with old IMU data."""
+    after the command to stop the motors, it must have slipped off its contact
+    (`has_slipped_off_contact`). Before that, a contact must be recorded, no catch may be in
+    progress, and the climb rate must be below `MAX_CLIMB_RATE_WHEN_FALLING_OFF_MAGNET_MPS`; during
+    the firmware's own landing, no fall is detected. Always False with old IMU data."""
     b, state = c.belief, c.state
     if not b.is_imu_fresh:
         return False
     if not state.is_before_weight_transfer_and_motor_stop:
-        return b.is_possibly_in_magnet_reach and has_slipped(b)
+        return b.is_possibly_in_magnet_reach and has_slipped_off_contact(b)
     if state.stop_or_land_command_count:
         return False
     caught = state.catch_setpoint_height_above_vehicle_m is None

@@ -15,7 +15,7 @@ from perchctl.mission.belief.contact import (
     HANGING_CONFIRMATION_DWELL_S,
     MIN_SATURATED_TO_FULL_THRUST_RATIO,
     NOT_CLIMBING_AT_FULL_THRUST,
-    SLOW_AT_NEARLY_FULL_THRUST,
+    SLOW_CLIMB_AT_NEARLY_FULL_THRUST,
     Support,
     contact_height_tolerance_m,
     gear_to_target_at_last_touch_or_now,
@@ -338,7 +338,9 @@ def is_thrust_insufficient_for_takeoff(c: Context) -> bool:
     """True if the vehicle has climbed too slowly at nearly full thrust for
     `SLOW_TAKEOFF_AT_NEARLY_FULL_THRUST_DWELL_S`, to be used during the take-off. Such a vehicle
     rises only in the ground effect or on a freshly charged battery, and would soon sink back."""
-    return c.true_for_s(SLOW_AT_NEARLY_FULL_THRUST) >= SLOW_TAKEOFF_AT_NEARLY_FULL_THRUST_DWELL_S
+    return (
+        c.true_for_s(SLOW_CLIMB_AT_NEARLY_FULL_THRUST) >= SLOW_TAKEOFF_AT_NEARLY_FULL_THRUST_DWELL_S
+    )
 
 
 def is_thrust_insufficient_to_fly_or_press(c: Context) -> bool:
@@ -359,7 +361,7 @@ def is_thrust_insufficient_to_fly_or_press(c: Context) -> bool:
         return True
     if (
         not ascends
-        and c.true_for_s(SLOW_AT_NEARLY_FULL_THRUST) >= SLOW_AT_NEARLY_FULL_THRUST_DWELL_S
+        and c.true_for_s(SLOW_CLIMB_AT_NEARLY_FULL_THRUST) >= SLOW_AT_NEARLY_FULL_THRUST_DWELL_S
     ):
         return True
     near = ascends and c.true_for_s(ASCENT_END_HEIGHT_REACHED) >= 0.0

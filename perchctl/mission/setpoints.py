@@ -298,7 +298,7 @@ def _lateral_error_and_velocity_world_xy(
     follows_target = maneuver.is_camera_guided or maneuver.presses_against_target
     if lateral is None or not follows_target or c.belief.target.world_position_m is None:
         x_m, y_m, _ = tel.position_m
-        return (reference.x_m - x_m, reference.y_m - y_m), c.belief.velocity_mps[:2]
+        return (reference.x_m - x_m, reference.y_m - y_m), c.belief.velocity_world_mps[:2]
     # The reference may still be on its way to the target. The offset applies to the gear at the
     # vehicle's present heading, and the reference's heading may differ.
     x_m, y_m = vehicle_world_xy_with_gear_under_target_m(c, tel.yaw_rad)

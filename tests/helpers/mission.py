@@ -254,7 +254,7 @@ def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:
         search_step_began_at_s=t_s,
         setpoint=PositionSetpoint(0.0, 0.0, z_m, 0.0),
         entry_m=(0.0, 0.0, z_m),
-        last_target_world_m=np.array([0.0, 0.0, CEILING_M]),
+        last_target_position_world_m=np.array([0.0, 0.0, CEILING_M]),
         hover_thrust=HOVER_THRUST,
         battery_fit=FINE_BATTERY,
         vehicle_world_z_at_last_contact_m=CEILING_M - 0.03 if phase is Phase.COMPLETE else None,

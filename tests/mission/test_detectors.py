@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import ImuMotion
 from perchctl.mission.belief.motion import (
-    FALL_DETECTOR_MAX_CLIMB_RATE_GAINED_MPS,
+    FALL_DETECTOR_GAINED_CLIMB_RATE_UPPER_CLAMP_MPS,
     MAX_CLIMB_RATE_GAINED_IF_FALLING_MPS,
     MAX_STEADY_CLIMB_RATE_DEVIATION_MPS,
     MAX_STEADY_LATERAL_VELOCITY_DEVIATION_MPS,
@@ -112,9 +112,9 @@ def test_a_climb_of_any_speed_delays_the_detection_of_a_fall_only_by_a_little(
 ) -> None:
     falls_mps2 = part * GRAVITY_MPS2
     # The offset that the detector learns meanwhile, and what it forgets, take a fifth at most.
-    late_s = (FALL_DETECTOR_MAX_CLIMB_RATE_GAINED_MPS - MAX_CLIMB_RATE_GAINED_IF_FALLING_MPS) / (
-        0.8 * falls_mps2
-    )
+    late_s = (
+        FALL_DETECTOR_GAINED_CLIMB_RATE_UPPER_CLAMP_MPS - MAX_CLIMB_RATE_GAINED_IF_FALLING_MPS
+    ) / (0.8 * falls_mps2)
     flight = [(0.0, 1.0), (5.0, speed_mps / 5.0), (-falls_mps2, late_s + 0.05)]
     assert watched(flight, rate_hz).last_fall_at_s > 1.0
 

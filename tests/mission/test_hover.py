@@ -181,7 +181,7 @@ def test_a_step_of_the_thrust_is_no_other_hover_thrust(step: float) -> None:
 
 @given(sigma=st.floats(1e-3, 0.2), dt_s=st.floats(0.0, 600.0))
 def test_what_is_not_measured_grows_unsure_up_to_what_is_felt(sigma: float, dt_s: float) -> None:
-    later = HoverThrust(50_000.0, sigma).propagate_without_measurement(dt_s)
+    later = HoverThrust(50_000.0, sigma).propagate_with_bounded_sigma(dt_s)
     assert sigma <= later.sigma_fraction <= max(sigma, HOVER_THRUST_BY_ACCELEROMETER_SIGMA_FRACTION)
 
 

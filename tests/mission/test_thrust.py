@@ -21,7 +21,7 @@ from perchctl.mission import (
 from perchctl.mission.belief.contact import (
     MAGNET_HOLDS_VEHICLE,
     NOT_CLIMBING_AT_FULL_THRUST,
-    SLOW_AT_NEARLY_FULL_THRUST,
+    SLOW_CLIMB_AT_NEARLY_FULL_THRUST,
 )
 from perchctl.mission.phase import PRE_LANDING_PHASES
 from perchctl.mission.setpoints import (
@@ -103,7 +103,9 @@ def test_how_little_thrust_proves_that_the_magnet_holds(
     ids=["quiet", "climbs", "pressed", "speeds up", "brakes", "climbs hard", "journey", "stale"],
 )
 def test_only_quiet_flight_teaches_the_hover_thrust(how: dict[str, Any], learns: bool) -> None:
-    start = remembering(state_in(Phase.ESTIMATE), hover_thrust=0.0, target_position_scatter_m=1.0)
+    start = remembering(
+        state_in(Phase.ESTIMATE), hover_thrust=0.0, recent_max_target_shift_per_frame_m=1.0
+    )
     after = flown(start, 0.3, thrust=50000.0, **how)
     assert after.belief.hover_thrust == (50000.0 if learns else 0.0)
 
@@ -200,7 +202,7 @@ def test_a_vehicle_that_sinks_or_crawls_at_full_thrust_lands(
 @pytest.mark.parametrize(("phase", "slow"), [(Phase.ALIGN, True), (Phase.PERCH, False)])
 def test_a_press_is_no_flight_on_too_little_thrust(phase: Phase, slow: bool) -> None:
     c = context_at(state_in(phase), at(thrust=float(FULL_THRUST))(BEGIN_S), PROFILE)
-    for condition in (NOT_CLIMBING_AT_FULL_THRUST, SLOW_AT_NEARLY_FULL_THRUST):
+    for condition in (NOT_CLIMBING_AT_FULL_THRUST, SLOW_CLIMB_AT_NEARLY_FULL_THRUST):
         assert condition.predicate(c.belief) is slow
 
 

@@ -27,7 +27,7 @@ from perchctl.profile import Profile
 from perchctl.values import cached_property, replace
 from perchctl.vehicle import Telemetry
 
-ESTIMATE_SETTLING_TIME_AFTER_POSITION_GAP_S = 0.5
+ESTIMATE_SETTLING_TIME_AFTER_POSITIONS_RETURN_S = 0.5
 """Time that the state estimate needs to converge once positions return after a gap, s. Smaller: the
 estimate is trusted before it has converged."""
 MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S = 0.13
@@ -102,9 +102,9 @@ class Belief:
     # --- motion, target and contact ---
     dead_reckoning: DeadReckoning = field(default_factory=DeadReckoning)
     #: target's position in world axes, m, in the last frame that measured it
-    last_target_world_m: Array | None = None
+    last_target_position_world_m: Array | None = None
     #: decaying maximum of the target's movement in the world between successive measured frames
-    target_position_scatter_m: float = 0.0
+    recent_max_target_shift_per_frame_m: float = 0.0
     #: vehicle's velocity from pictures alone
     visual_motion: VisualMotion = field(default_factory=VisualMotion)
     #: Kalman filter of the lateral offset from the target
@@ -245,7 +245,7 @@ class Belief:
     @cached_property
     def is_position_trusted(self) -> bool:
         """True if the estimated position and velocity can be trusted: positions have arrived for
-        `ESTIMATE_SETTLING_TIME_AFTER_POSITION_GAP_S`, have not led the vehicle away from its
+        `ESTIMATE_SETTLING_TIME_AFTER_POSITIONS_RETURN_S`, have not led the vehicle away from its
         setpoint (diverged) and, if they come from pictures, agree with the accelerometer."""
         doubted = self.is_position_diverged or (
             self.is_target_position_source and self.obs.camera_imu_mismatch is not None
@@ -253,7 +253,7 @@ class Belief:
         returns = (
             self.position_last_stale_at_s is not None
             and self.obs.t_s - self.position_last_stale_at_s
-            <= ESTIMATE_SETTLING_TIME_AFTER_POSITION_GAP_S
+            <= ESTIMATE_SETTLING_TIME_AFTER_POSITIONS_RETURN_S
         )
         return not (doubted or self.is_position_stale or returns)
 
@@ -378,7 +378,7 @@ class Belief:
         return abs(self.obs.telemetry.acc_z_g - 1.0) <= self.profile.planner.perch.contact_acc_g
 
     @cached_property
-    def velocity_mps(self) -> Vector:
+    def velocity_world_mps(self) -> Vector:
         """Estimated velocity in world axes, m/s. While the position is valid, the bias that wind
         adds to the estimate is subtracted."""
         vx_mps, vy_mps, vz_mps = self.obs.telemetry.velocity_mps
@@ -412,8 +412,8 @@ class Belief:
 
     @cached_property
     def speed_mps(self) -> float:
-        """Magnitude of `velocity_mps`, all three axes, m/s."""
-        return math.sqrt(sum(v * v for v in self.velocity_mps))
+        """Magnitude of `velocity_world_mps`, all three axes, m/s."""
+        return math.sqrt(sum(v * v for v in self.velocity_world_mps))
 
     @cached_property
     def climb_mps(self) -> float:

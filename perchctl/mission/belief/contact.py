@@ -119,7 +119,7 @@ MAX_CLIMB_RATE_IF_FALLING_IN_WEIGHT_TRANSFER_MPS = -0.05
 by raw thrust has begun, m/s."""
 
 # --- time ---
-MIN_TIME_AFTER_STOP_TO_TRUST_ZERO_THRUST_S = 5.0
+MIN_TIME_AFTER_MOTOR_STOP_TO_TRUST_ZERO_THRUST_S = 5.0
 """Time after a stop command from which zero thrust alone shows that the motors are off, s: the
 flying bit stays set for 2 s."""
 MOTORS_OFF_DWELL_S = 0.1
@@ -333,7 +333,7 @@ def is_pressing(b: Belief) -> bool:
 # --- Conditions that must last for some time ---
 
 
-def is_slipping(b: Belief) -> bool:
+def is_slipping_off_contact(b: Belief) -> bool:
     """True if the vehicle is sinking faster than `complete.slip_mps` after a contact, and either
     its estimated height is not above the height of the contact (within
     `MAX_HEIGHT_ESTIMATE_DRIFT_UP_DURING_SLIP_M`), or the accelerometer reads less than
@@ -389,7 +389,7 @@ def _is_in_contact_with_target(b: Belief) -> bool:
 def _is_magnet_holding_vehicle(b: Belief) -> bool:
     return (
         is_thrust_too_low_to_fly(b)
-        and not is_slipping(b)
+        and not is_slipping_off_contact(b)
         and (b.is_position_valid or is_vertically_motionless(b))
     )
 
@@ -405,7 +405,7 @@ def _is_hanging_with_motors_stopped(b: Belief) -> bool:
             or not b.is_reported_thrust_reliable
         )
         and is_vertically_motionless(b)
-        and not is_slipping(b)
+        and not is_slipping_off_contact(b)
     )
 
 
@@ -441,11 +441,12 @@ def _is_hanging(b: Belief) -> bool:
 
 def _are_motors_off(b: Belief) -> bool:
     """True if the thrust is zero and the supervisor no longer reports the vehicle as flying.
-    `MIN_TIME_AFTER_STOP_TO_TRUST_ZERO_THRUST_S` after a stop command, zero thrust is enough."""
+    `MIN_TIME_AFTER_MOTOR_STOP_TO_TRUST_ZERO_THRUST_S` after a stop command, zero thrust is
+    enough."""
     motor_stop_commanded_at_s = b.command_history.motor_stop_commanded_at_s
     long_off = (
         motor_stop_commanded_at_s is not None
-        and b.obs.t_s - motor_stop_commanded_at_s > MIN_TIME_AFTER_STOP_TO_TRUST_ZERO_THRUST_S
+        and b.obs.t_s - motor_stop_commanded_at_s > MIN_TIME_AFTER_MOTOR_STOP_TO_TRUST_ZERO_THRUST_S
     )
     return b.telemetry.thrust < 1 and (not b.telemetry.has_bit(FLYING) or long_off)
 
@@ -525,7 +526,7 @@ def _is_not_climbing_at_full_thrust(b: Belief) -> bool:
     return flies and full and b.climb_mps < MAX_MOTIONLESS_CLIMB_RATE_MPS
 
 
-def _is_slow_at_nearly_full_thrust(b: Belief) -> bool:
+def _is_climbing_slowly_at_nearly_full_thrust(b: Belief) -> bool:
     full = b.telemetry.thrust >= MIN_NEARLY_FULL_THRUST_RATIO * FULL_THRUST
     flies = b.command_history.maneuver.is_in_free_air
     return flies and full and b.climb_mps < MIN_CLIMB_RATE_AT_FULL_THRUST_MPS
@@ -539,7 +540,7 @@ MAGNET_HOLDS_VEHICLE = Condition(
     "magnet holds", _is_magnet_holding_vehicle, required_data=RequiredData.TELEMETRY
 )
 """The magnet is holding the vehicle: the thrust is low, and the vehicle is not slipping."""
-SLIPPING = Condition("slipping", is_slipping)
+SLIPPING_OFF_CONTACT = Condition("slipping", is_slipping_off_contact)
 """The vehicle is falling away from the proven contact."""
 HANGING_WITH_MOTORS_STOPPED = Condition(
     "the whole weight hangs", _is_hanging_with_motors_stopped, required_data=RequiredData.TELEMETRY
@@ -580,9 +581,9 @@ NOT_CLIMBING_AT_FULL_THRUST = Condition(
 )
 """The thrust is at its limit in free air, and the vehicle is not climbing: it is too weak, or
 something is above it."""
-SLOW_AT_NEARLY_FULL_THRUST = Condition(
+SLOW_CLIMB_AT_NEARLY_FULL_THRUST = Condition(
     "slow at nearly full thrust",
-    _is_slow_at_nearly_full_thrust,
+    _is_climbing_slowly_at_nearly_full_thrust,
     persists_across_phases=True,
     required_data=RequiredData.TELEMETRY,
 )
@@ -591,7 +592,7 @@ can hover with thrust to spare."""
 SUPPORT_CONDITIONS = (
     TARGET_CONTACT,
     MAGNET_HOLDS_VEHICLE,
-    SLIPPING,
+    SLIPPING_OFF_CONTACT,
     HANGING_WITH_MOTORS_STOPPED,
     HANGING,
     MOTORS_OFF_AS_COMMANDED,
@@ -600,7 +601,7 @@ SUPPORT_CONDITIONS = (
     CLIMB_BLOCKED,
     IMU_SHOWS_SUPPORT,
     NOT_CLIMBING_AT_FULL_THRUST,
-    SLOW_AT_NEARLY_FULL_THRUST,
+    SLOW_CLIMB_AT_NEARLY_FULL_THRUST,
 )
 """All conditions defined in this module."""
 
@@ -687,8 +688,8 @@ def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
             return b.is_imu_fresh and (b.is_position_valid or reckons)
 
 
-def has_slipped(b: Belief) -> bool:
-    """True if the vehicle has slipped off its contact: `is_slipping` has been true for
+def has_slipped_off_contact(b: Belief) -> bool:
+    """True if the vehicle has slipped off its contact: `is_slipping_off_contact` has been true for
     `complete.slip_dwell_s`. Once the weight transfer by raw thrust has begun, one tick is enough in
     which fresh telemetry shows a specific force below `complete.slip_acc_g` and a climb rate below
     `MAX_CLIMB_RATE_IF_FALLING_IN_WEIGHT_TRANSFER_MPS`."""
@@ -699,4 +700,4 @@ def has_slipped(b: Belief) -> bool:
     )
     if falls and b.is_imu_fresh and b.climb_mps < MAX_CLIMB_RATE_IF_FALLING_IN_WEIGHT_TRANSFER_MPS:
         return True
-    return b.true_for_s(SLIPPING) >= complete.slip_dwell_s
+    return b.true_for_s(SLIPPING_OFF_CONTACT) >= complete.slip_dwell_s

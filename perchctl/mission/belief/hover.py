@@ -37,7 +37,7 @@ MAX_HOVER_THRUST_CORRECTION_IN_DESCENT_SIGMAS = 3.0
 """Largest correction of the hover thrust during a descent, in standard deviations at the start of
 the descent. Larger: contact with an obstacle corrupts the estimate. Smaller: with a weak battery,
 the vehicle sinks too fast."""
-MAX_THRUST_DEVIATION_FRACTION_TO_LEARN_HOVER = 0.2
+MAX_THRUST_DEVIATION_FRACTION_TO_LEARN_HOVER_THRUST = 0.2
 """Largest relative difference between the thrust in quiet flight and the estimated hover thrust; a
 larger difference means that the ceiling or a hand holds the vehicle. Larger: a held vehicle
 corrupts the estimate. Smaller: a real change is rejected."""
@@ -52,13 +52,13 @@ Smaller: a fall corrupts the estimate."""
 MAX_SPECIFIC_FORCE_TO_LEARN_HOVER_THRUST_G = 1.3
 """Largest specific force at which thrust divided by specific force measures hover thrust, g.
 Larger: an impact corrupts the estimate."""
-MIN_DESCENT_THRUST_TO_HOVER_RATIO_TO_LEARN = 0.5
+MIN_DESCENT_TO_HOVER_THRUST_RATIO_TO_LEARN_HOVER_THRUST = 0.5
 """Fraction of the hover thrust at the start of the descent below which thrust is not proportional
 to force, so nothing is learned from such a thrust."""
-MIN_SPECIFIC_FORCE_DIVIDING_THRUST_G = 0.75
+SPECIFIC_FORCE_LOWER_CLAMP_FOR_HOVER_THRUST_G = 0.75
 """Smallest specific force by which the thrust of a single sample is divided, g; a lower one is
 raised to this value."""
-MAX_SPECIFIC_FORCE_DIVIDING_THRUST_G = 1.5
+SPECIFIC_FORCE_UPPER_CLAMP_FOR_HOVER_THRUST_G = 1.5
 """Largest specific force by which the thrust of a single sample is divided, g; a higher one is
 lowered to this value."""
 
@@ -72,7 +72,8 @@ def estimate_hover_thrust(b: Belief) -> HoverThrust:
         return b.hover_thrust_estimate
     tel = b.telemetry
     divisor_g = min(
-        MAX_SPECIFIC_FORCE_DIVIDING_THRUST_G, max(MIN_SPECIFIC_FORCE_DIVIDING_THRUST_G, tel.acc_z_g)
+        SPECIFIC_FORCE_UPPER_CLAMP_FOR_HOVER_THRUST_G,
+        max(SPECIFIC_FORCE_LOWER_CLAMP_FOR_HOVER_THRUST_G, tel.acc_z_g),
     )
     sample = max(MIN_FIRMWARE_POSITION_MODE_THRUST, tel.thrust / divisor_g)
     return HoverThrust(b.imu.mean_hover_thrust or sample, FALLBACK_HOVER_THRUST_SIGMA_FRACTION)
@@ -95,7 +96,7 @@ def learn_hover_thrust_in_quiet_flight(b: Belief, dt_s: float) -> HoverThrust:
 
     The first estimate is the recent mean of thrust per measured g (`ImuMotion.mean_hover_thrust`)
     or, if that is 0 (unknown), the reported thrust. Later, the estimate does not change in a tick
-    whose thrust differs from it by more than `MAX_THRUST_DEVIATION_FRACTION_TO_LEARN_HOVER`,
+    whose thrust differs from it by more than `MAX_THRUST_DEVIATION_FRACTION_TO_LEARN_HOVER_THRUST`,
     because the ceiling or a hand then holds the vehicle.
     """
     thrust, old = b.telemetry.thrust, b.hover_thrust_estimate
@@ -103,7 +104,7 @@ def learn_hover_thrust_in_quiet_flight(b: Belief, dt_s: float) -> HoverThrust:
         return HoverThrust(
             b.imu.mean_hover_thrust or thrust, HOVER_THRUST_BY_ACCELEROMETER_SIGMA_FRACTION
         )
-    if abs(thrust / old.thrust - 1.0) > MAX_THRUST_DEVIATION_FRACTION_TO_LEARN_HOVER:
+    if abs(thrust / old.thrust - 1.0) > MAX_THRUST_DEVIATION_FRACTION_TO_LEARN_HOVER_THRUST:
         return old  # the ceiling or a hand holds the vehicle
     return old.with_measurement(thrust, dt_s)
 
@@ -130,7 +131,7 @@ def learn_hover_thrust_in_descent(b: Belief, dt_s: float) -> HoverThrust:
         MIN_SPECIFIC_FORCE_TO_LEARN_HOVER_THRUST_G
         <= tel.acc_z_g
         <= MAX_SPECIFIC_FORCE_TO_LEARN_HOVER_THRUST_G
-        and thrust >= MIN_DESCENT_THRUST_TO_HOVER_RATIO_TO_LEARN * first
+        and thrust >= MIN_DESCENT_TO_HOVER_THRUST_RATIO_TO_LEARN_HOVER_THRUST * first
     )
     is_on_floor = b.command_history.floor_detected_at_s is not None
     if (

@@ -40,13 +40,13 @@ MAX_TELEMETRY_GAP_S = 0.2
 """Time without telemetry that counts as a gap, s. In this time a vehicle falls 20 cm, further than
 a vehicle that is still hanging can move. Larger: a gap can hide a fall. Smaller: two lost packets
 count as a gap."""
-MAX_SPEED_NOISE_ACROSS_GAP_MPS = 0.25
+MAX_CLIMB_RATE_NOISE_ACROSS_TELEMETRY_GAP_MPS = 0.25
 """Largest change in a hanging vehicle's vertical speed that noise of the estimate causes across a
 gap, m/s. Larger: a short fall goes undetected."""
-MAX_UNEXPLAINED_HEIGHT_CHANGE_IN_GAP_M = 0.25
+MAX_UNEXPLAINED_HEIGHT_CHANGE_IN_TELEMETRY_GAP_M = 0.25
 """Largest vertical movement across a gap that the speed before the gap does not explain, m. Larger:
 a short fall goes undetected."""
-MAX_CLIMB_RATE_IF_FALLEN_IN_GAP_MPS = -0.3
+MAX_CLIMB_RATE_IF_FALLEN_IN_TELEMETRY_GAP_MPS = -0.3
 """Climb rate below which the vehicle has fallen across a gap in the telemetry, m/s: a hanging
 vehicle never reaches it, and a falling one reaches it after 5 cm. Closer to 0: noise counts as a
 fall."""
@@ -63,7 +63,7 @@ MAX_CLIMB_RATE_GAINED_IF_FALLING_MPS = -0.25
 """Climb rate gained within `FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S` below which the vehicle
 counts as falling, whatever the accelerometer's offset, m/s. Closer to 0: vibration counts as a
 fall."""
-FALL_DETECTOR_MAX_CLIMB_RATE_GAINED_MPS = 0.5
+FALL_DETECTOR_GAINED_CLIMB_RATE_UPPER_CLAMP_MPS = 0.5
 """Largest upward speed, gained within `FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S`, that a vehicle
 must lose before it counts as falling, m/s. Larger: a fall just after a climb is detected later.
 Smaller: a climb that is braked counts as a fall."""
@@ -110,10 +110,10 @@ samples as much as a push does."""
 MIN_VELOCITY_STEP_OF_ESTIMATE_CORRECTION_MPS = 0.08
 """Lateral speed gained between two samples above which it is a correction of the estimate and not a
 motion, m/s."""
-ESTIMATE_CORRECTION_VELOCITY_STEP_GROWTH_MPS2 = 5.0
+ESTIMATE_CORRECTION_VELOCITY_STEP_THRESHOLD_GROWTH_MPS2 = 5.0
 """Increase of `MIN_VELOCITY_STEP_OF_ESTIMATE_CORRECTION_MPS` for each second between the two
 samples, m/s^2."""
-TILT_ERROR_TIME_CONSTANT_S = 6.0
+TILT_ERROR_DECAY_TIME_CONSTANT_S = 6.0
 """Time constant with which the firmware's own filter removes an error of its tilt, s."""
 MEAN_HOVER_THRUST_TIME_CONSTANT_S = 0.5
 """Time constant of the mean hover thrust, s. Larger: a sagging battery is noticed later."""
@@ -236,7 +236,7 @@ class FallDetector:
     `MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G`) minus its slowly learned offset. The climb rate v
     gained recently is
 
-        v' = min(FALL_DETECTOR_MAX_CLIMB_RATE_GAINED_MPS,
+        v' = min(FALL_DETECTOR_GAINED_CLIMB_RATE_UPPER_CLAMP_MPS,
                  v + a dt - v dt / FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S)
 
     The upper bound keeps the end of a climb from counting as a fall. The vehicle is falling if v <
@@ -271,7 +271,7 @@ class FallDetector:
         )
         sink = self.climb_rate_gained_mps + corrected_mps2 * dt_s
         sink = min(
-            FALL_DETECTOR_MAX_CLIMB_RATE_GAINED_MPS,
+            FALL_DETECTOR_GAINED_CLIMB_RATE_UPPER_CLAMP_MPS,
             sink - sink * dt_s / FALL_DETECTOR_FORGETTING_TIME_CONSTANT_S,
         )
         light = (
@@ -309,12 +309,16 @@ class ImpactDetector:
     newest_impact: Impact = Impact()  # newest impact from below
 
     def update_impact(
-        self, newest_sample: Impact, world_z_m: float, up_acceleration_mps2: float, dt_s: float
+        self,
+        newest_impact_candidate: Impact,
+        world_z_m: float,
+        up_acceleration_mps2: float,
+        dt_s: float,
     ) -> Self:
         """Return the detector after `dt_s` of vertical acceleration `up_acceleration_mps2` (world
-        z, without gravity). `newest_sample` describes the sample at the end of that time as if an
-        impact began there: its time, its climb rates and its specific force, but no height.
-        `world_z_m` is the estimated height, world z, at that sample."""
+        z, without gravity). `newest_impact_candidate` describes the sample at the end of that time
+        as if an impact began there: its time, its climb rates and its specific force, but no
+        height. `world_z_m` is the estimated height, world z, at that sample."""
         upward_speed_gained_mps = max(
             0.0,
             self.upward_speed_gained_mps
@@ -324,19 +328,19 @@ class ImpactDetector:
         recent = (
             m
             for m in self.recent_samples
-            if newest_sample.t_s - m.t_s <= MAX_IMPACT_DETECTION_DELAY_S
+            if newest_impact_candidate.t_s - m.t_s <= MAX_IMPACT_DETECTION_DELAY_S
         )
-        recent_samples = (*recent, newest_sample)
+        recent_samples = (*recent, newest_impact_candidate)
         return replace(
             self,
             upward_speed_gained_mps=upward_speed_gained_mps,
-            last_impact_or_bounce_at_s=newest_sample.t_s
+            last_impact_or_bounce_at_s=newest_impact_candidate.t_s
             if upward_speed_gained_mps > MIN_FLOOR_IMPACT_SPEED_GAIN_MPS
             else self.last_impact_or_bounce_at_s,
             recent_samples=recent_samples,
             newest_impact=_update_newest_impact(
                 self.newest_impact,
-                newest_sample,
+                newest_impact_candidate,
                 world_z_m,
                 recent_samples,
                 upward_speed_gained_mps,
@@ -346,25 +350,26 @@ class ImpactDetector:
 
 def _update_newest_impact(
     old: Impact,
-    newest_sample: Impact,
+    newest_impact_candidate: Impact,
     world_z_m: float,
-    recent_samples: tuple[Impact, ...],
+    recent_impact_candidates: tuple[Impact, ...],
     upward_speed_gained_mps: float,
 ) -> Impact:
     """Return the newest impact after one more sample.
 
-    `newest_sample` holds the sample's time, its two climb rates (from the state estimate and from
-    the accelerometer, m/s) and its specific force along the body's z axis (g), but no height.
-    `recent_samples` holds such samples from the last `MAX_IMPACT_DETECTION_DELAY_S`, including
-    `newest_sample`. `world_z_m` is the estimated height of the vehicle at the newest sample.
+    `newest_impact_candidate` holds the sample's time, its two climb rates (from the state estimate
+    and from the accelerometer, m/s) and its specific force along the body's z axis (g), but no
+    height. `recent_impact_candidates` holds such samples from the last
+    `MAX_IMPACT_DETECTION_DELAY_S`, including `newest_impact_candidate`. `world_z_m` is the
+    estimated height of the vehicle at the newest sample.
 
     An impact is detected while `upward_speed_gained_mps` exceeds `MIN_FLOOR_IMPACT_SPEED_GAIN_MPS`:
 
     - More than `MAX_BOUNCE_TIME_AFTER_IMPACT_S` after `old`, a new impact replaces `old`. Its climb
-      rates before the impact are the lowest of `recent_samples`, because the onboard estimate often
-      includes the whole impact before it is detected. Climb rates are signed, so the lowest one is
-      the fastest descent. Its peak is the largest specific force of `recent_samples` along the
-      body's z axis, g.
+      rates before the impact are the lowest of `recent_impact_candidates`, because the onboard
+      estimate often includes the whole impact before it is detected. Climb rates are signed, so the
+      lowest one is the fastest descent. Its peak is the largest specific force of
+      `recent_impact_candidates` along the body's z axis, g.
     - Up to that time, the detection is a bounce or the rest of the same impact and is merged into
       `old`: it can only lower the climb rates and raise the peak. Time and height remain those of
       `old`.
@@ -372,13 +377,13 @@ def _update_newest_impact(
     Without a detection, a sample up to that time after `old` can still raise the peak; later, `old`
     is returned unchanged.
     """
-    follows = newest_sample.t_s - old.t_s <= MAX_BOUNCE_TIME_AFTER_IMPACT_S
+    follows = newest_impact_candidate.t_s - old.t_s <= MAX_BOUNCE_TIME_AFTER_IMPACT_S
     if upward_speed_gained_mps > MIN_FLOOR_IMPACT_SPEED_GAIN_MPS:
         begun = Impact(
-            newest_sample.t_s,
-            min(moment.estimated_climb_before_impact_mps for moment in recent_samples),
-            min(moment.imu_climb_before_impact_mps for moment in recent_samples),
-            max(moment.peak_acc_z_g for moment in recent_samples),
+            newest_impact_candidate.t_s,
+            min(moment.estimated_climb_before_impact_mps for moment in recent_impact_candidates),
+            min(moment.imu_climb_before_impact_mps for moment in recent_impact_candidates),
+            max(moment.peak_acc_z_g for moment in recent_impact_candidates),
             world_z_m,
         )
         if not follows:
@@ -394,7 +399,7 @@ def _update_newest_impact(
             ),
         )
     return (
-        replace(old, peak_acc_z_g=max(old.peak_acc_z_g, newest_sample.peak_acc_z_g))
+        replace(old, peak_acc_z_g=max(old.peak_acc_z_g, newest_impact_candidate.peak_acc_z_g))
         if follows
         else old
     )
@@ -415,16 +420,16 @@ class SteadySpeedDetector:
     # mean over `MEAN_LATERAL_VELOCITY_TIME_CONSTANT_S`
     mean_lateral_velocity_mps: tuple[float, float] = (0.0, 0.0)
 
-    def update_steady_speed(self, t_s: float, velocity_mps: Vector, dt_s: float) -> Self:
-        """Return the detector at `t_s`, `dt_s` after its previous sample. `velocity_mps` is the
-        newest velocity in world axes, integrated from the accelerometer.
+    def update_steady_speed(self, t_s: float, velocity_world_mps: Vector, dt_s: float) -> Self:
+        """Return the detector at `t_s`, `dt_s` after its previous sample. `velocity_world_mps` is
+        the newest velocity in world axes, integrated from the accelerometer.
 
         Each speed counts as constant from a start time, which is reset to `t_s` if the vertical
         speed has changed by more than `MAX_STEADY_CLIMB_RATE_DEVIATION_MPS` since then, or if the
         lateral velocity differs from its mean by more than
         `MAX_STEADY_LATERAL_VELOCITY_DEVIATION_MPS`.
         """
-        x, y, z = velocity_mps
+        x, y, z = velocity_world_mps
         climb_rate_became_steady_at_s, steady_climb_rate_mps = (
             self.climb_rate_became_steady_at_s,
             self.steady_climb_rate_mps,
@@ -534,7 +539,7 @@ class ImuMotion(
             or not 0.0 < dt_s <= MAX_TELEMETRY_GAP_S
             or motion.acceleration_frozen_for_s > MAX_FROZEN_READING_DURATION_S
         ):
-            return _restart_after_gap(motion, last, new)
+            return _restart_after_telemetry_gap(motion, last, new)
         motion, up_acceleration_mps2 = _integrate_acceleration(motion, last, new, dt_s)
         now = Impact(
             new.t_s,
@@ -587,7 +592,9 @@ class ImuMotion(
         )
 
 
-def _restart_after_gap(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
+def _restart_after_telemetry_gap(
+    motion: ImuMotion, last: Telemetry | None, new: Telemetry
+) -> ImuMotion:
     """Return the motion at the sample `new`, the first sample ever (`last` is None) or the first
     one after a gap in the telemetry. The detectors restart; the velocity and the learned offsets of
     the accelerometer are kept. After a gap, the motion records its end, and whether the vehicle may
@@ -611,7 +618,7 @@ def _restart_after_gap(motion: ImuMotion, last: Telemetry | None, new: Telemetry
         0.0 <= motion.position_frozen_for_s <= MAX_FROZEN_READING_DURATION_S
         and new.start == last.start
     )
-    if alive and _can_exclude_fall(last, new, height_change_in_gap_m):
+    if alive and _can_exclude_fall_in_telemetry_gap(last, new, height_change_in_gap_m):
         return replace(
             motion,
             last_telemetry_gap_ended_at_s=new.t_s,
@@ -625,7 +632,9 @@ def _restart_after_gap(motion: ImuMotion, last: Telemetry | None, new: Telemetry
     )
 
 
-def _can_exclude_fall(last: Telemetry, new: Telemetry, height_change_in_gap_m: float) -> bool:
+def _can_exclude_fall_in_telemetry_gap(
+    last: Telemetry, new: Telemetry, height_change_in_gap_m: float
+) -> bool:
     """True if the state estimate shows that the vehicle did not fall in the gap between the samples
     `last` and `new`. `height_change_in_gap_m` is the total change of the estimated height over
     successive gaps, at most 0."""
@@ -636,12 +645,12 @@ def _can_exclude_fall(last: Telemetry, new: Telemetry, height_change_in_gap_m: f
         return False
     if 0.0 < dt_s <= MAX_TELEMETRY_GAP_S:
         return (
-            new.velocity_mps[2] > MAX_CLIMB_RATE_IF_FALLEN_IN_GAP_MPS
-            and height_change_in_gap_m > -MAX_UNEXPLAINED_HEIGHT_CHANGE_IN_GAP_M
+            new.velocity_mps[2] > MAX_CLIMB_RATE_IF_FALLEN_IN_TELEMETRY_GAP_MPS
+            and height_change_in_gap_m > -MAX_UNEXPLAINED_HEIGHT_CHANGE_IN_TELEMETRY_GAP_M
         )
     return (
-        abs(gained_mps) <= MAX_SPEED_NOISE_ACROSS_GAP_MPS
-        and abs(unexplained_m) <= MAX_UNEXPLAINED_HEIGHT_CHANGE_IN_GAP_M
+        abs(gained_mps) <= MAX_CLIMB_RATE_NOISE_ACROSS_TELEMETRY_GAP_MPS
+        and abs(unexplained_m) <= MAX_UNEXPLAINED_HEIGHT_CHANGE_IN_TELEMETRY_GAP_M
     )
 
 
@@ -695,12 +704,12 @@ def _estimate_tilt_error(
     """
     gained_mps = math.dist(new.velocity_mps[:2], last.velocity_mps[:2])
     turned = (new.roll_rad - last.roll_rad, new.pitch_rad - last.pitch_rad)
-    kept = 1.0 - dt_s / TILT_ERROR_TIME_CONSTANT_S
+    kept = 1.0 - dt_s / TILT_ERROR_DECAY_TIME_CONSTANT_S
     (roll, pitch), rates = motion.roll_pitch_error_rad, motion.body_roll_pitch_rate_radps
     if (
         gained_mps
         <= MIN_VELOCITY_STEP_OF_ESTIMATE_CORRECTION_MPS
-        + ESTIMATE_CORRECTION_VELOCITY_STEP_GROWTH_MPS2 * dt_s
+        + ESTIMATE_CORRECTION_VELOCITY_STEP_THRESHOLD_GROWTH_MPS2 * dt_s
     ):
         return TiltError((kept * roll, kept * pitch), (turned[0] / dt_s, turned[1] / dt_s))
     error = (

@@ -55,7 +55,8 @@ TILT_TOO_LARGE = Condition("tilted", _is_tilt_too_large, persists_across_phases=
 LATERAL_SPEED_EXCEEDS_DRAUGHT = Condition[Belief](
     "lateral blow",
     lambda b: (
-        b.is_position_valid and math.hypot(*b.velocity_mps[:2]) > MAX_LATERAL_SPEED_FROM_DRAUGHT_MPS
+        b.is_position_valid
+        and math.hypot(*b.velocity_world_mps[:2]) > MAX_LATERAL_SPEED_FROM_DRAUGHT_MPS
     ),
 )
 """The vehicle is moving laterally faster than any draught can move it."""

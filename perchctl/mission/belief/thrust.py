@@ -65,7 +65,7 @@ class HoverThrust:
             sigma_fraction=math.sqrt(self.sigma_fraction**2 + drift_fraction_per_sqrt_s**2 * dt_s),
         )
 
-    def propagate_without_measurement(self, dt_s: float) -> HoverThrust:
+    def propagate_with_bounded_sigma(self, dt_s: float) -> HoverThrust:
         """Return the estimate `dt_s` later without a measurement. Its standard deviation grows as
         in quiet flight, but not beyond `HOVER_THRUST_BY_ACCELEROMETER_SIGMA_FRACTION`, because the
         accelerometer always gives an estimate of that precision in flight. A larger standard

@@ -22,7 +22,7 @@ import numpy as np
 
 from perchctl.mission.belief import hover
 from perchctl.mission.belief.battery import update_battery_fit_from_telemetry
-from perchctl.mission.belief.belief import ESTIMATE_SETTLING_TIME_AFTER_POSITION_GAP_S, Belief
+from perchctl.mission.belief.belief import ESTIMATE_SETTLING_TIME_AFTER_POSITIONS_RETURN_S, Belief
 from perchctl.mission.belief.contact import (
     HANGING_CONFIRMATION_DWELL_S,
     IMU_SHOWS_SUPPORT,
@@ -104,7 +104,7 @@ def update_belief(
         world_frame_shift_in_tick_m=ZERO_VECTOR,
     )
     sample = LateralMotionSample(
-        obs.telemetry.t_s, b.acceleration_from_tilt_world_xy_mps2, b.velocity_mps[:2]
+        obs.telemetry.t_s, b.acceleration_from_tilt_world_xy_mps2, b.velocity_world_mps[:2]
     )
     b = replace(b, lateral_offset_filter=b.lateral_offset_filter.with_sample(sample))
     b = _update_target(b)
@@ -181,10 +181,14 @@ def _update_target(b: Belief) -> Belief:
     if target.world_m is None:
         return b
     spread_m = 0.0
-    if b.last_target_world_m is not None:
-        moved_m = float(np.linalg.norm(target.world_m - b.last_target_world_m))
-        spread_m = max(moved_m, TARGET_SCATTER_DECAY_FACTOR_PER_FRAME * b.target_position_scatter_m)
-    return replace(b, last_target_world_m=target.world_m, target_position_scatter_m=spread_m)
+    if b.last_target_position_world_m is not None:
+        moved_m = float(np.linalg.norm(target.world_m - b.last_target_position_world_m))
+        spread_m = max(
+            moved_m, TARGET_SCATTER_DECAY_FACTOR_PER_FRAME * b.recent_max_target_shift_per_frame_m
+        )
+    return replace(
+        b, last_target_position_world_m=target.world_m, recent_max_target_shift_per_frame_m=spread_m
+    )
 
 
 def _reset_conditions_after_tick_gap(b: Belief) -> Belief:
@@ -232,7 +236,7 @@ def _shift_stored_positions_after_frame_jump(b: Belief) -> Belief:
     moved_m = (x - lx - vx * dt_s, y - ly - vy * dt_s, z - lz - vz * dt_s)
     returns = (
         b.position_last_stale_at_s is not None
-        and obs.t_s - b.position_last_stale_at_s <= ESTIMATE_SETTLING_TIME_AFTER_POSITION_GAP_S
+        and obs.t_s - b.position_last_stale_at_s <= ESTIMATE_SETTLING_TIME_AFTER_POSITIONS_RETURN_S
     )
     if dt_s > MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S or returns:
         moved_m = (0.0, 0.0, 0.0)
@@ -539,7 +543,7 @@ def _update_estimators(b: Belief) -> Belief:
     away = not maneuver.climbs_to_target or b.target.gear_to_target_z_m > near_m
     b = replace(
         b,
-        hover_thrust_estimate=b.hover_thrust_estimate.propagate_without_measurement(dt_s),
+        hover_thrust_estimate=b.hover_thrust_estimate.propagate_with_bounded_sigma(dt_s),
         rotor_thrust=hover.filter_rotor_thrust(b, sample_dt_s),
     )
     found = b.hover_thrust_estimate
@@ -583,7 +587,8 @@ def _update_camera_mounting(b: Belief) -> CameraMountingMonitor:
         and b.command_history.maneuver.is_in_free_air
     ):
         return b.mounting
-    assert b.last_target_world_m is not None
+    assert b.last_target_position_world_m is not None
     return update_camera_mounting_monitor(
-        b.mounting, make_camera_mounting_sample(obs.t_s, obs.telemetry, b.last_target_world_m)
+        b.mounting,
+        make_camera_mounting_sample(obs.t_s, obs.telemetry, b.last_target_position_world_m),
     )

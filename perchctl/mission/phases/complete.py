@@ -8,7 +8,7 @@ from perchctl.mission.belief.contact import (
     MOTORS_OFF_AS_COMMANDED,
     MOTORS_OFF_DWELL_S,
     gear_to_target_at_last_touch_or_now,
-    has_slipped,
+    has_slipped_off_contact,
 )
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.context import Context
@@ -82,7 +82,7 @@ COMPLETE = PhaseDefinition(
         back_off_row(
             "slipped",
             {Phase.COMPLETE},
-            lambda c: has_slipped(c.belief),
+            lambda c: has_slipped_off_contact(c.belief),
             lambda c: (
                 "slipped while hanging"
                 if c.state.motor_stop_commanded_at_s

@@ -19,7 +19,7 @@ TARGET_POSITION_STEADY = Condition[Context](
     "estimated",
     lambda c: (
         c.belief.target.is_fresh
-        and c.belief.target_position_scatter_m <= c.planner.estimate.spread_m
+        and c.belief.recent_max_target_shift_per_frame_m <= c.planner.estimate.spread_m
     ),
 )
 """The target is fresh, and its position is steady within `estimate.spread_m`."""
