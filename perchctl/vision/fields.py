@@ -151,8 +151,8 @@ def deinterlace_frame(
     quarter of the frame period before and after the frame's time.
 
     The order of the fields follows from successive woven frames: the later field of a frame is more
-    similar to the earlier field of the next one. Until combing is found in a frame, only every
-    third frame is checked.
+    similar to the earlier field of the next one. To save time, only every third frame is checked
+    for combing until one is found to be interlaced; the others count as whole frames.
     """
     skip = (
         frame.picture_kind is None

@@ -109,8 +109,9 @@ class FilterSetup:
         acceleration_process_noise: process noise that replaces Q; the covariance of each pose then
             replaces R. If None, Q and R are used.
         roll_pitch_bias_sigma_rad: standard deviation of the bias of the vehicle's roll and pitch.
-        max_target_speed_mps: upper limit of the target's speed, in the track's frame, while there
-            is no measurement. In the world frame it is the frame's drift speed; in the level frame
+        max_target_speed_mps: upper limit of the target's speed, in the track's frame, in
+            predictions without a measurement. In the world frame, where the target only moves
+            because the state estimate drifts, it is the largest drift speed; in the level frame,
             it is infinite.
         max_nis_without_restart: largest normalized innovation squared (NIS) of a measurement that
             updates the track; with a larger one, the track restarts.
@@ -292,11 +293,12 @@ def step_track(
         measurement: the frame's measurement; None or not finite if the marker was not measured.
         t_s: the frame's time.
 
-    Returns None if there is no track, because the marker was never measured or was not seen for
-    more than `n_max` frames (k_n <= n_max in equation 3). A frame that is not newer than the track
-    changes nothing. A gap of more than `MAX_TRACK_GAP_S` in either direction ends the track, and a
-    measurement then starts a new one. The track also restarts at a measurement that the motion
-    model does not explain (`FilterSetup.max_nis_without_restart`).
+    The track ends after more than `setup.max_unseen_frames` successive frames without a measurement
+    (k_n <= n_max in equation 3), or if `t_s` differs from the track's time by more than
+    `MAX_TRACK_GAP_S` (1 s), earlier or later. A measurement starts a new track if there is none or
+    if the gap has ended the old one, and restarts a track whose motion model does not explain the
+    measurement (`setup.max_nis_without_restart`). Otherwise, a frame that is not newer than the
+    track changes nothing. Returns None if there is no track.
     """
     if measurement is not None and not is_finite(measurement.z):
         measurement = None

@@ -47,8 +47,9 @@ class MergedTarget:
         track_frame_velocity_mps: velocity of the target (3,).
         track_frame_position_cov_m2, yaw_var_rad2: covariance (3, 3) of the position, and variance
             of the yaw; the biases are not included.
-        track_frame_shift_per_bias_sigma_m: change (3, 4) of the position for one standard deviation
-            of each bias, in columns: the vehicle's roll and pitch, the print's size and curl.
+        track_frame_shift_per_bias_sigma_m: change (3, 4) of the position for one standard
+            deviation of each bias, in columns: the vehicle's roll and pitch, the print's size and
+            curl.
         unseen_frames: number of frames since the last measurement.
         stage: markers measured in the newest frame.
     """
@@ -198,8 +199,8 @@ arise because the motion was measured one frame earlier."""
 def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detection]:
     """Return the detections with their corners moved to where they were at the frame's time, when
     the middle row was exposed. Each corner is moved back by its image velocity
-    (`Detections.flow_pxps`) times the delay of its row relative to the middle row. Markers without
-    a known image velocity stay unchanged.
+    (`Detections.flow_pxps`) times the delay of its row relative to the middle row. Markers
+    without a known image velocity stay unchanged.
 
     If the readout time `setup.readout_s` is None (unknown), the corners are not moved, and
     `corner_shift_per_readout_sigma_px` is their possible shift for a readout time of 12 ms

@@ -294,8 +294,9 @@ class ScoredPose(PoseCandidate):
 
 @dataclass(frozen=True, eq=False)
 class TiltPrior:
-    """Expected direction of the target's unit normal (out of the paper) in camera axes, (3,), and
-    its standard deviation. The normal is None if unknown."""
+    """Expected direction of the target's unit normal (out of the paper) in camera axes, (3,), None
+    if unknown, and the standard deviation `sigma_rad` of the angle between the actual and the
+    expected normal."""
 
     target_normal_cam: Array | None
     sigma_rad: float
@@ -396,9 +397,9 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
     sheet's curl, from the weighted least-squares problem linearised at the pose.
 
     The covariance includes corner noise, scaled by how well the residuals agree with it, and shifts
-    common to several corners. If `points.allows_for_sheet_curl` is True, it also includes a twist
-    of the sheet, but never its bowl-shaped curl. Covariance and chi-squared are infinite if the
-    corners do not determine the pose.
+    common to several corners. If `points.allows_for_sheet_curl` is True, it also includes the
+    saddle-shaped curl of the sheet. The bowl-shaped curl is never included, but returned
+    separately. Covariance and chi-squared are infinite if the corners do not determine the pose.
     """
     W = points.whitening_matrix
     A, error = W.dot(scored.reprojection_jacobian), W.dot(scored.reprojection_error_px.ravel())
@@ -518,11 +519,14 @@ def _choose_most_likely_pose(
 
 
 def corner_lift_by_sheet_curl(object_points_m: Array, sheet_curl_sigma_per_m: float) -> Array:
-    """Return the height of corners (n, 3), m, in the marker's axes, above the flat sheet for one
-    standard deviation of two curl modes: a bowl (all corners on one side) and a saddle
-    (neighbouring corners on opposite sides). `sheet_curl_sigma_per_m` is the standard deviation of
-    the height divided by the squared distance from the centre. The result has the shape (2n, 2), m;
-    each corner has two equal rows, for its x and y."""
+    """Return how far, m, one standard deviation of the sheet's curl lifts the corners out of the
+    flat sheet, along its normal. The result has the shape (2n, 2). Its columns are two modes of
+    curl: a bowl, which lifts all corners to the same side, and a saddle, which lifts neighbouring
+    corners to opposite sides. Each corner has two equal rows, one for x and one for y in the image.
+
+    `object_points_m` (n, 3) are the corners in the marker's axes. `sheet_curl_sigma_per_m` is the
+    standard deviation of the lift divided by the squared distance from the sheet's centre, 1/m.
+    """
     x, y = object_points_m[:, 0], object_points_m[:, 1]
     lift: Array = sheet_curl_sigma_per_m * np.stack([x * x + y * y, math.sqrt(2.0) * x * y], axis=1)
     return lift.repeat(2, axis=0)
@@ -700,9 +704,10 @@ def _side_sigma_px(detection: Detection, corners: Array) -> Array:
 
 
 def _line_whitening_elements(normals: Array, sigma_px: float | Array) -> Array:
-    """Return the elements, at `_SIDE_WHITENING_FLAT_INDICES`, of the whitening matrix for corners
-    that are intersections of four fitted lines. Each line has independent errors of offset and
-    tilt.
+    """Return the nonzero elements (32,), 1/px, of the whitening matrix (8, 8) of a marker whose
+    corners are intersections of four fitted lines. The matrix transforms the errors of the corners
+    to the lines' errors of offset and tilt, which are independent and have unit variance.
+    `_SIDE_WHITENING_FLAT_INDICES` are the elements' indices in the flattened matrix.
 
     `normals` (4, 2) are the lines' unit normals; `sigma_px` is the standard deviation of a line's
     position at its two corners, px, a scalar for all lines, or (4,).

@@ -30,9 +30,10 @@ _RAW_CORNER_SIGMA_PX = 1.0  # for corners that a search has found, before refine
 
 @dataclass(frozen=True)
 class OwnTargetPosition:
-    """Position `xy_world_m` of the vehicle's own target in the world frame of the state estimate.
-    If it is None (unknown), the target closest to the upward axis through the gear is selected. A
-    target further than `max_distance_m` from a known position belongs to another vehicle."""
+    """Expected horizontal position of the vehicle's own target, `xy_world_m` (x, y), in the world
+    frame of the state estimate. If it is None (unknown), the target closest to the vertical axis
+    through the gear is selected. A target whose horizontal distance from a known position is more
+    than `max_distance_m` belongs to another vehicle."""
 
     xy_world_m: tuple[float, float] | None = None
     max_distance_m: float = math.inf

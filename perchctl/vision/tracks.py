@@ -62,11 +62,12 @@ class TrackSetup:
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """Result of updating the tracks with one frame: the tracks, the tracked target (`lock`), a
-    competing target-like pattern (`rival`), and the gate's decision on the frame's pose
-    (`verdict`). Lock and rival are None if there is none.
+    """Result of updating the tracks with one frame: the tracks by name (``joint``, or ``large`` and
+    ``small``), the tracked target (`lock`), a competing target-like pattern (`rival`), and whether
+    the frame's pose was accepted as a pose of the tracked target (`verdict`). Lock and rival are
+    None if there is none.
 
-    `marker_poses.poses_by_track` is empty if the gate rejects the frame's pose.
+    `marker_poses` are the frame's poses; its `poses_by_track` is empty if the pose was rejected.
     """
 
     marker_poses: MarkerPoses
@@ -84,14 +85,15 @@ def update_tracks(
     is_in_world_frame: bool,
     setup: TrackSetup,
 ) -> TrackedFrame:
-    """Update the tracks with those poses of one frame that the gate accepts. The gate judges the
-    frame's most certain pose (`judge_pose`); if it rejects this pose, the tracks are only predicted
-    to `t_s`, the time of the frame. `attitude` is the vehicle's state at this time; None if
-    unknown.
+    """Update the tracks with the poses of one frame, `marker_poses`. The gate decides from the most
+    certain of them whether the frame shows the tracked target (`judge_pose`): it accepts all poses
+    or none. Without accepted poses, the tracks are only predicted to `t_s`, the time of the frame.
+    `attitude` is the vehicle's state at this time; None if unknown.
 
     If the gate restarts the tracks, or if they change between the world frame (`is_in_world_frame`)
-    and the level frame, they start over. A pose that does not continue a track is also rejected if
-    it shows another vehicle's target. If the gate is disabled, there is no lock and no rival.
+    and the level frame, they start over. If there is no lock, or if it changes to another position,
+    a pose is also rejected if it shows another vehicle's target. If the gate is disabled, there is
+    no lock and no rival.
     """
     filter_setup = setup.select_filter(is_in_world_frame)
     measurements = {
@@ -215,11 +217,15 @@ _MAX_ALTERNATIVE_TO_TRACK_CHI2_RATIO = 0.25
 
 @dataclass(frozen=True, eq=False)
 class FramePose:
-    """A frame's pose with its filter measurement, which is in the world frame of the state estimate
-    if `is_in_world_frame` is True, otherwise relative to the gear in the level frame.
+    """A frame's most certain pose, and the filter measurement made from it, which is in the world
+    frame of the state estimate if `is_in_world_frame` is True, otherwise relative to the gear in
+    the level frame. `t_s` is the time of the frame.
+
     `has_both_markers` is True if the frame shows both markers and they do not contradict each
-    other, `is_locked_target_in_view` if the expected position of the tracked target is in the
-    image, and `is_attitude_unknown` if the camera is used without a vehicle."""
+    other. `is_locked_target_in_view` is False only if the position where the locked target is
+    expected is known to be outside the image. `is_attitude_unknown` is True if there is no state
+    estimate for this frame, as with a camera without a vehicle.
+    """
 
     t_s: float
     pose: MarkerPose
@@ -393,8 +399,8 @@ def update_lock(
 
 @dataclass(frozen=True, eq=False)
 class _Innovation:
-    """Innovation of a pose, which is measurement minus prediction of (yaw, x, y, z) (4,), rad and
-    m, in the track's frame, and the covariance `S` (4, 4) of the innovation."""
+    """Innovation of a pose: `yaw_xyz` (4,) is the measured minus the predicted (yaw, x, y, z), rad
+    and m, in the track's frame (level or world), and `S` (4, 4) is its covariance."""
 
     yaw_xyz: Array
     S: Array
@@ -477,8 +483,8 @@ def _has_state_estimate_jumped(
     last saw it, but in the world frame, it is not where its track predicts it. The change of the
     pose relative to the gear is then small enough for a hovering vehicle and much smaller than
     `world_innovation_yaw_xyz` (4,), which is measured minus predicted (yaw, x, y, z) in the world,
-    rad and m. False in the level frame, and if the target was last seen more than
-    `_MAX_LAST_VIEW_AGE_FOR_JUMP_S` ago."""
+    rad and m. Always False if the track is in the level frame, or if the target was last seen more
+    than `_MAX_LAST_VIEW_AGE_FOR_JUMP_S` (0.35 s) ago."""
     dt_s = frame_pose.t_s - lock.track.t_s
     if not frame_pose.is_in_world_frame or dt_s > _MAX_LAST_VIEW_AGE_FOR_JUMP_S:
         return False

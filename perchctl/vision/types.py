@@ -24,8 +24,8 @@ GearToTargetInLevel = Array
 
 
 class VisibleMarkers(Enum):
-    """The markers of the target that are in view, which are the stages of the paper (section
-    II-A.2)."""
+    """Which of the target's two markers are in view: none, only the large one, both, or only the
+    small one. The paper (section II-A.2) calls these the stages of an approach."""
 
     NONE = "none"
     LARGE = "large"  # Stage 1 of the paper, equation 5.
@@ -180,11 +180,13 @@ class Detection:
 
 @dataclass(frozen=True)
 class EdgeShift:
-    """Common shift of all black-white edges of an image (blooming, gamma). `white_growth_px` is the
-    distance by which each edge is displaced from the white side to the black side; if positive, a
-    marker's black square looks smaller than it is, by twice this distance in width. `sigma_px` is
-    the standard deviation of `white_growth_px`, and `age_frames` the number of frames since it was
-    measured."""
+    """Common shift of all black-white edges of an image, due to blooming or gamma.
+
+    `white_growth_px` is the distance by which each edge is displaced from the white side
+    to the black side; if positive, a marker's black square looks smaller than it is, by twice this
+    distance in width. `sigma_px` is the standard deviation of this distance, and `age_frames` the
+    number of frames since it was measured.
+    """
 
     white_growth_px: float
     sigma_px: float
@@ -193,17 +195,27 @@ class EdgeShift:
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """The target's markers as detected in one frame: `large` and `small`, None if not detected, and
-    the image velocity of their corners since the previous detections, `flow_pxps`, px/s.
-    `edge_shift` is the common shift of all black-white edges of the image; None if unknown."""
+    """The target's markers as detected in one frame.
+
+    Attributes:
+        frame_index, t_s: index and exposure time of the frame.
+        large, small: the two markers; None if not detected.
+        is_mirrored_marker_seen: True if no marker was detected, but one was decoded as its mirror
+            image.
+        target_count: number of complete targets, with both markers, that a search of the image
+            found; 0 if there was no search.
+        flow_pxps: image velocity of each marker's corners since the previous detections,
+            px/s: one velocity per corner, (4, 2), or one for all four corners, (2,). Empty if
+            unknown.
+        edge_shift: common shift of all black-white edges of the image; None if unknown.
+    """
 
     frame_index: int
     t_s: float
     large: Detection | None = None
     small: Detection | None = None
-    is_mirrored_marker_seen: bool = False  # True if a marker was decoded as its mirror image.
-    target_count: int = 0  # Number of complete targets, with both markers, that a search found.
-    # Image velocity of each marker's corners (4, 2), or one velocity (2,) for all of its corners.
+    is_mirrored_marker_seen: bool = False
+    target_count: int = 0
     flow_pxps: dict[MarkerName, Array] = field(default_factory=dict)
     edge_shift: EdgeShift | None = None
 
@@ -318,7 +330,7 @@ class TargetEstimate:
         t_s: time of the estimate, which is the time of the frame, or a later time for a prediction.
         last_measured_at_s, small_marker_last_measured_at_s: exposure times (on the clock of `t_s`)
             of the last frame in which the target was measured, and of the last frame in which its
-            small marker was measured.
+            small marker was measured; -inf if there is no such frame.
         stage: markers measured in the newest frame; ``NONE`` while the filter coasts.
         is_measured_in_newest_frame: True if the newest frame contains a detection of the target.
         tracked: True if the target was measured at most `kalman.n_max` frames ago. If False, the
@@ -326,16 +338,18 @@ class TargetEstimate:
         unseen_frames: number of frames since the last detection.
         e_m: vector from the gear to the target in the level frame, (3,).
         sigma_m, sigma_yaw_rad: standard deviations of `e_m`, (3,), and of `e_yaw_rad`. While only a
-            rival is seen, which may be the target, sigma_m also covers the rival's position.
+            similar pattern at a contradictory position is seen, which may be the target, they also
+            cover its position and heading.
         e_yaw_rad: heading of the target in the level frame, in (-pi, pi].
         velocity_mps: velocity (3,) from the filter, in level axes: the rate of change of `e_m`
             (`kalman.frame: level`), or the velocity of the target in the world (`kalman.frame:
             world`).
-        measured_gear_to_target_world_m, measured_gear_to_target_sigma_m: vector (3,) from the gear
-            to the target at `last_measured_at_s`, in the axes of the state estimate's world frame,
-            and the larger of the standard deviations of its x and y; None and infinite without an
-            attitude. Unlike `e_m`, the vector does not depend on how far the vehicle has moved
+        measured_gear_to_target_world_m: vector (3,) from the gear to the target at
+            `last_measured_at_s`, in the axes of the state estimate's world frame; None if the
+            attitude was unknown. Unlike `e_m`, it does not depend on how far the vehicle has moved
             since then.
+        measured_gear_to_target_sigma_m: the larger of the standard deviations of this vector along
+            the horizontal axes of the level frame; infinite if the vector is None.
         world_m, world_yaw_rad: position (3,) and heading of the target in the world frame of the
             vehicle's state estimate; None without an attitude.
         world_velocity_mps: velocity (3,) of the target in the world frame of the state estimate,
@@ -362,9 +376,10 @@ class TargetEstimate:
 
 
 class MotionErrors(NamedTuple):
-    """Running mean squared errors of the vehicle's estimated motion between poses, as angles seen
-    from the camera, rad^2: one for the motion computed from the difference of two estimated
-    positions, and one for the motion computed from velocity times time."""
+    """Running mean squared errors, rad^2, of the vehicle's estimated motion between two poses of
+    the target: one for the motion computed from the difference of two estimated positions, and one
+    for the motion computed from velocity times time. An error is the angle, seen from the camera,
+    between the predicted and the measured direction of the target."""
 
     position_based_mean_squared_error_rad2: float = 0.0
     velocity_based_mean_squared_error_rad2: float = 0.0
@@ -372,9 +387,10 @@ class MotionErrors(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LastPose:
-    """The last pose of the target, the vehicle's attitude at that time (None if unknown), and the
-    errors of the vehicle's estimated motion between poses. The prediction of the next pose weights
-    the two motion estimates by these errors."""
+    """The last accepted pose of the target, the vehicle's attitude, position and velocity at that
+    time (`attitude`, None if unknown), and the mean squared errors of the vehicle's motion between
+    poses. There is one error for the motion computed from positions and one for the motion computed
+    from velocities; the smaller error has more weight in the prediction of the next pose."""
 
     pose: MarkerPose
     attitude: VehicleState | None
@@ -387,7 +403,8 @@ class TargetLock:
     with an accepted pose (`accepted_frame_count`), and whether any of these poses used both markers
     (`has_shown_both_markers`). The track is in the world frame of the state estimate if
     `is_in_world_frame` is True, otherwise relative to the gear in the level frame.
-    `track_before_last_pose` is the track without its last pose; None after the first pose."""
+    `track_before_last_pose` is the track as it was before its last pose updated it; None after the
+    first pose."""
 
     track: MarkerTrack
     pose: MarkerPose
@@ -408,7 +425,8 @@ class RivalTrack:
         first_seen_at_s: time of the first frame that showed the rival.
         seen_frame_count, frames_with_both_markers: number of frames that showed the rival, and
             number of frames that showed both of its markers.
-        has_different_range: True if the rival's range differs significantly from the target's.
+        has_different_range: True if the rival's z, which is its range from a
+            camera that looks straight up, differs significantly from the target's.
         relative_position_text: the rival's position relative to the target, in words.
     """
 
@@ -472,19 +490,33 @@ class InterlacingState:
 
 @dataclass(frozen=True, eq=False)
 class PipelineState:
-    """The complete state of the pipeline between frames: tracks, lock and rival, the last poses,
-    detections and target estimate, and the interlacing of the images. `PipelineState()` is the
-    initial state."""
+    """The complete state of the pipeline between frames. `PipelineState()` is the initial state.
+
+    Attributes:
+        tracks: Kalman filters of the target, by name: ``joint``, or ``large`` and ``small``.
+        are_tracks_in_world_frame: True if the tracks are in the world frame of the state estimate,
+            False if in the level frame.
+        marker_poses: poses estimated from the newest frame.
+        target: estimate for the last frame in which there was a track; None before the first one.
+        last_detections: detections of the last frame with an accepted marker; None if it is more
+            than 1 s old.
+        last_pose: the last accepted pose; None if there is no track.
+        frames_with_contradicting_markers: number of successive accepted frames with both markers in
+            which the markers contradict each other.
+        frames_without_markers: number of successive frames without a marker.
+        lock: the target that the pipeline is locked onto; None if there is none.
+        rival: a similar pattern whose position contradicts the lock; None if there is none.
+        interlacing_state: what is known about the interlacing of the images.
+    """
 
     tracks: dict[str, MarkerTrack] = field(default_factory=dict)
-    # True if the tracks are in the world frame of the state estimate, False if in the level frame.
     are_tracks_in_world_frame: bool = False
-    marker_poses: MarkerPoses = MarkerPoses()  # Poses estimated from the newest frame.
-    target: TargetEstimate | None = None  # Estimate for the last frame in which there was a track.
+    marker_poses: MarkerPoses = MarkerPoses()
+    target: TargetEstimate | None = None
     last_detections: Detections | None = None
     last_pose: LastPose | None = None
     frames_with_contradicting_markers: int = 0
-    frames_without_markers: int = 0  # number of successive frames without a marker
+    frames_without_markers: int = 0
     lock: TargetLock | None = None
     rival: RivalTrack | None = None
     interlacing_state: InterlacingState = InterlacingState()
@@ -492,23 +524,29 @@ class PipelineState:
 
 @dataclass(frozen=True, eq=False)
 class PipelineOutput:
-    """Result of processing one frame, for the planner and the log: the detected markers, their
-    poses by source (``joint``, ``large``, ``small``), the target estimate (None if there is no
-    track), and a note if the frame's pose was rejected or restarted the tracks, or if the frame
-    shows several targets."""
+    """Result of processing one frame, for the planner and the log.
+
+    Attributes:
+        detections: the markers that were detected.
+        poses: the target's poses by source: ``joint``, ``large`` or ``small``.
+        target: the target estimate for the time of the frame; None if there is no track.
+        stage: which markers were detected in this frame.
+        frames_with_contradicting_markers: number of successive accepted frames with both markers in
+            which the markers contradict each other.
+        picture_kind: whether the image is a whole frame, interlaced (``woven``) or a field.
+        lock_note: why this frame's pose was rejected, or accepted at an unexpected position, or
+            that the frame shows several targets; otherwise empty.
+        is_foreign_target: True if the pose was rejected because, judged by its position, it
+            shows another vehicle's target.
+    """
 
     detections: Detections
     poses: dict[str, MarkerPose]
-    target: TargetEstimate | None  # Estimate for the time of the frame.
-    stage: VisibleMarkers  # Markers that were detected in this frame.
-    # Number of successive accepted frames with both markers in which the markers contradict each
-    # other.
+    target: TargetEstimate | None
+    stage: VisibleMarkers
     frames_with_contradicting_markers: int = 0
     picture_kind: PictureKind = "whole"
-    # Why the pose from this frame was rejected, or was accepted at an unexpected position; or that
-    # the frame shows several targets.
     lock_note: str = ""
-    # True if this frame showed another vehicle's target, judged by its position.
     is_foreign_target: bool = False
 
 
