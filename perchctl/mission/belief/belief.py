@@ -56,7 +56,8 @@ class GearToTargetDistance:
     sigma_m: float
 
     def is_certainly_within(self, radius_m: float) -> bool:
-        """True if the distance plus one standard deviation is at most `radius_m`."""
+        """True if the distance plus one standard deviation is at most `radius_m`; False while the
+        distance is unknown."""
         return self.distance_xy_m + self.sigma_m <= radius_m
 
     @property
@@ -265,13 +266,15 @@ class Belief:
 
     @cached_property
     def camera_latency_s(self) -> float:
-        """Assumed age of a frame when it arrives, s."""
+        """Assumed age of a camera frame when it arrives, s, counted from its exposure: the
+        profile's `camera.start_latency_s` plus the correction measured in this flight."""
         return self.profile.camera.start_latency_s + self.obs.camera_latency_above_profile_s
 
     @cached_property
     def is_estimated_velocity_being_corrected(self) -> bool:
-        """True while the newest external position still corrects the estimated velocity: it is at
-        most `MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S` older than the camera's latency."""
+        """True while the newest external position still corrects the estimated velocity: it is
+        older than the camera's latency by at most
+        `MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S`."""
         return (
             self.position_correction_age_s
             <= self.camera_latency_s + MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S
@@ -488,7 +491,8 @@ class Belief:
     @cached_property
     def does_camera_motion_match_vehicle(self) -> bool:
         """True if the motion in the pictures agrees with the vehicle's own motion: with its
-        accelerometer if the target is the positioning system, otherwise with its state estimate."""
+        accelerometer if the target is the position source, otherwise with its state estimate. False
+        if they disagree, and until there has been enough motion to compare them."""
         if self.is_target_position_source:
             return (
                 self.obs.visual_inertial_motion is not None and self.obs.camera_imu_mismatch is None

@@ -9,9 +9,10 @@ vehicle. The vehicle's position and its maneuver then distinguish the magnet fro
 both from another object.
 
 One threshold decides whether the thrust exceeds hover thrust (`is_thrust_above_hover`). A vehicle
-at rest with that thrust is pressing (`is_pressing`): against the target if it is at the target's
-height (`TARGET_CONTACT`), against an obstacle if the setpoint is above the vehicle
-(`CLIMB_BLOCKED`), and, if its position is unknown, against an unknown object (`IMU_SHOWS_SUPPORT`).
+at rest with that thrust is pressing (`is_pressing`):
+against the target if it is at the target's height (`TARGET_CONTACT`), against an obstacle if the
+setpoint is above the vehicle (`CLIMB_BLOCKED`), and, if its position is unknown, against an unknown
+object (`IMU_SHOWS_SUPPORT`).
 `IMU_SHOWS_SUPPORT` also applies if the thrust is too small; its lower threshold is as far below
 hover thrust as the threshold for a press is above it. A change of `MIN_PRESS_TO_HOVER_THRUST_RATIO`
 therefore affects all of these conditions, and `Support.AIR`. `HANGING`, `MAGNET_HOLDS_VEHICLE` and
@@ -196,8 +197,9 @@ def _dead_reckoned_gear_to_target(b: Belief) -> GearToTargetDistance:
 
 def gear_to_target_at_last_touch(b: Belief) -> GearToTargetDistance | None:
     """Return the gear's distance from the target's axis at the last touch, while the vehicle
-    retreats from an attempt (RECOVER). None in all other maneuvers, with a fresh sighting, or once
-    motion capture shows that the vehicle has left the position of that touch."""
+    retreats from an attempt (RECOVER). None in all other maneuvers, with a fresh sighting, before
+    the first touch, or once motion capture shows that the vehicle is more than
+    `perch.contact_xy_m` away, horizontally, from the position where the retreat began."""
     if (
         not b.command_history.maneuver.retreats_after_attempt
         or b.gear_to_target_at_last_contact is None
@@ -294,7 +296,8 @@ def is_thrust_too_low_to_fly(b: Belief) -> bool:
 
     The limit is `complete.hold_ratio` times hover thrust. Position mode never commands less than
     `MIN_FIRMWARE_POSITION_MODE_THRUST`, so that value is the limit if it is larger and still too
-    small to lift the vehicle.
+    small to lift the vehicle. False while hover thrust is unknown or the reported thrust is not
+    reliable.
     """
     most = b.profile.planner.complete.hold_ratio * b.hover_thrust
     if MAX_NON_LIFTING_TO_HOVER_THRUST_RATIO * b.hover_thrust >= MIN_FIRMWARE_POSITION_MODE_THRUST:
@@ -411,8 +414,10 @@ def _is_hanging_with_motors_stopped(b: Belief) -> bool:
 
 def _is_hanging(b: Belief) -> bool:
     """True if something is holding the vehicle up: it is motionless, off the floor, at a thrust too
-    small to support it. Without a position, a magnet cannot be distinguished from the floor; the
-    slow weight transfer is safe in both cases."""
+    small to support it. During a descent to the floor, it must also be at the height of the last
+    contact, at the target's height, or still where the descent began, because a drifted height may
+    hide the floor. Without a valid position, a magnet cannot be distinguished from the floor, and
+    the result is True in both cases; the slow weight transfer is safe in both."""
     tel, complete = b.telemetry, b.profile.planner.complete
     if not b.is_position_valid:
         return is_thrust_too_low_to_fly(b) and is_vertically_motionless(b)
@@ -464,9 +469,10 @@ def _are_motors_off_despite_thrust_command(b: Belief) -> bool:
 
 
 def _is_on_floor(b: Belief) -> bool:
-    """True if the vehicle is motionless, at a thrust too small to support it, and is near the
-    ground or has descended. The height alone is not sufficient evidence, because the estimate may
-    have drifted."""
+    """True if the vehicle is motionless, at a thrust too small to support it, is not near the
+    target's height, and either is lower than `landing.handover_m` or has lost height in a descent
+    without a recorded contact. The height alone is not sufficient evidence, because the estimate
+    may have drifted."""
     near_target = (
         b.obs.target is not None
         and abs(b.target.gear_to_target_z_m) <= MIN_GEAR_TO_TARGET_Z_WHEN_ON_FLOOR_M
