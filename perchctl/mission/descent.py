@@ -30,7 +30,7 @@ from perchctl.mission.belief.contact import (
     MOTORS_OFF_DWELL_S,
     ON_FLOOR,
     has_slipped_off_contact,
-    is_pressing,
+    is_pressing_against_surface,
 )
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.belief.reckoning import MAGNET_REACH_BELOW_TARGET_M
@@ -185,7 +185,8 @@ def begin_landing(state: PlannerState) -> PlannerState:
         severity=max(state.severity, Severity.LAND),
         condition_start_times_s={},
         belief=reset_phase_dependent_conditions(b),
-        must_end_press=state.catch_setpoint_height_above_vehicle_m is None and is_pressing(b),
+        must_end_press=state.catch_setpoint_height_above_vehicle_m is None
+        and is_pressing_against_surface(b),
         last_stop_or_land_command_at_s=None,
         stop_or_land_command_count=0,
     )

@@ -12,7 +12,7 @@ setpoint, the firmware levels the vehicle after 0.5 s and cuts the motors after 
 
 from __future__ import annotations
 
-from perchctl.mission.belief.contact import is_pressing
+from perchctl.mission.belief.contact import is_pressing_against_surface
 from perchctl.mission.belief.evidence import update_condition_start_times
 from perchctl.mission.belief.quality import hold_reason
 from perchctl.mission.belief.update import reset_phase_dependent_conditions
@@ -109,7 +109,7 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
     # A commanded press has wound up the integrators, whatever the reported thrust. A vehicle whose
     # fall is being caught runs at full thrust without pressing.
     ends = row.to in (Phase.RECOVER, Phase.LANDING)
-    presses_against_target = state.phase is Phase.PERCH or is_pressing(c.belief)
+    presses_against_target = state.phase is Phase.PERCH or is_pressing_against_surface(c.belief)
     new = replace(
         state,
         belief=reset_phase_dependent_conditions(c.belief),

@@ -18,7 +18,7 @@ from perchctl.mission.belief.contact import (
     SLOW_CLIMB_AT_NEARLY_FULL_THRUST,
     Support,
     contact_height_tolerance_m,
-    gear_to_target_at_last_touch_or_now,
+    gear_to_target_at_last_contact_or_now,
     max_press_thrust,
 )
 from perchctl.mission.belief.motion import MAX_PUSH_TO_ESTIMATE_RESPONSE_DELAY_S
@@ -563,7 +563,8 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         lambda c: c.true_for_s(HANGING) >= HELD_BY_OTHER_OBJECT_DWELL_S,
         lambda c: (
             f"the vehicle is hanging at the target's height, "
-            f"{gear_to_target_at_last_touch_or_now(c.belief).text}: the target's magnet may hold it"
+            f"{gear_to_target_at_last_contact_or_now(c.belief).text}: "
+            "the target's magnet may hold it"
         ),
         diagnosis=VehicleDiagnosis.HANGING_AT_LAST_TOUCH,
     ),

@@ -101,7 +101,7 @@ class Perception:
                 self._mirrored += 1
             elif output.detections.markers:
                 self._mirrored = 0
-            if output.is_foreign_target:
+            if output.is_foreign_target_seen:
                 self.refused = output.lock_note
             self._calibrate(output, used_s)
             yield picture, output

@@ -28,8 +28,8 @@ _MIN_INTER_TO_INTRA_FIELD_ENERGY_RATIO = 1.4
 # their neighbours.
 _ROWS_PER_COMBING_GROUP = 8
 # A pixel counts if its difference exceeds this multiple of the mean difference within the fields.
-_MIN_ROW_DIFFERENCE_TO_MEAN_RATIO = 5.0
-_MIN_ROW_DIFFERENCE_GREY = 8.0
+_MIN_COUNTED_ROW_DIFFERENCE_TO_MEAN_RATIO = 5.0
+_MIN_COUNTED_ROW_DIFFERENCE_GREY = 8.0
 # Energy per pixel of strong row differences that noise alone may cause.
 _NOISE_ENERGY_PER_PIXEL_GREY2 = 0.25
 _COMBING_CHECK_INTERVAL_FRAMES = 3
@@ -40,7 +40,7 @@ _ALIASING_SIGMA_WITHOUT_BLUR_PX, _ALIASING_DECAY_PER_BLUR_PX2 = 0.8, 2.45
 _INTERPOLATION_TAPS = np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0
 
 _NTSC_AND_PAL_FRAME_PERIODS_S = (1 / 30, 1 / 25)
-_PERIOD_RANGE_ROUNDED_TO_NTSC_OR_PAL_S = (0.029, 0.045)
+_FRAME_PERIOD_RANGE_ROUNDED_TO_NTSC_OR_PAL_S = (0.029, 0.045)
 _VALID_FRAME_PERIOD_RANGE_S = (0.004, 0.1)
 _MAX_STORED_FRAME_PERIODS = 25
 _MIN_LOST_FRAME_TO_MEDIAN_PERIOD_RATIO = 1.8
@@ -74,7 +74,10 @@ def is_combed(image: GreyImage) -> bool:
     own = cv2.addWeighted(above2, 0.5, below2, 0.5, 0.0)
     cv2.absdiff(row, other, other)
     cv2.absdiff(row, own, own)
-    least = max(_MIN_ROW_DIFFERENCE_TO_MEAN_RATIO * cv2.mean(own)[0], _MIN_ROW_DIFFERENCE_GREY)
+    least = max(
+        _MIN_COUNTED_ROW_DIFFERENCE_TO_MEAN_RATIO * cv2.mean(own)[0],
+        _MIN_COUNTED_ROW_DIFFERENCE_GREY,
+    )
     energy = [
         cv2.norm(cv2.threshold(each, least, 0, cv2.THRESH_TOZERO, each)[1], cv2.NORM_L2SQR)
         for each in (other, own)
@@ -204,9 +207,9 @@ def _estimate_frame_period_s(frame_periods_s: tuple[float, ...]) -> float:
         p for p in frame_periods_s if p < _MIN_LOST_FRAME_TO_MEDIAN_PERIOD_RATIO * middle_s
     )
     if (
-        _PERIOD_RANGE_ROUNDED_TO_NTSC_OR_PAL_S[0]
+        _FRAME_PERIOD_RANGE_ROUNDED_TO_NTSC_OR_PAL_S[0]
         < period_s
-        < _PERIOD_RANGE_ROUNDED_TO_NTSC_OR_PAL_S[1]
+        < _FRAME_PERIOD_RANGE_ROUNDED_TO_NTSC_OR_PAL_S[1]
     ):
         return min(_NTSC_AND_PAL_FRAME_PERIODS_S, key=lambda p: abs(p - period_s))
     return period_s

@@ -28,7 +28,7 @@ YAW, YAW_RATE, X, VX, Y, VY, Z, VZ = range(8)
 MEASURED_ELEMENTS, RATE_ELEMENTS = slice(YAW, None, 2), slice(YAW_RATE, None, 2)
 POSITION, VELOCITY = slice(X, None, 2), slice(VX, None, 2)
 # columns of the biases: the vehicle's roll and pitch, and the print's size and curl
-TILT_BIASES, PRINT_BIASES = slice(0, 2), slice(2, 4)
+TILT_BIAS_COLUMNS, PRINT_BIAS_COLUMNS = slice(0, 2), slice(2, 4)
 
 MAX_TRACK_GAP_S = 1.0
 """Longest gap between two frames of a track, s; a longer gap ends the track."""

@@ -47,7 +47,7 @@ class MergedTarget:
         track_frame_velocity_mps: velocity of the target (3,).
         track_frame_position_cov_m2, yaw_var_rad2: covariance (3, 3) of the position, and variance
             of the yaw; the biases are not included.
-        track_frame_shift_per_bias_sigma_m: change (3, 4) of the position for one standard
+        track_frame_position_shift_per_bias_sigma_m: change (3, 4) of the position for one standard
             deviation of each bias, in columns: the vehicle's roll and pitch, the print's size and
             curl.
         unseen_frames: number of frames since the last measurement.
@@ -57,7 +57,7 @@ class MergedTarget:
     track_frame_xyz_yaw: Array
     track_frame_velocity_mps: Array
     track_frame_position_cov_m2: Array
-    track_frame_shift_per_bias_sigma_m: Array
+    track_frame_position_shift_per_bias_sigma_m: Array
     yaw_var_rad2: float
     unseen_frames: int
     stage: VisibleMarkers
@@ -143,7 +143,7 @@ def merge_tracks(
             track_frame_xyz_yaw=track.x[_XYZ_YAW_STATE_INDICES],
             track_frame_velocity_mps=track.x[VELOCITY],
             track_frame_position_cov_m2=track.P[POSITION, POSITION],
-            track_frame_shift_per_bias_sigma_m=track.state_shift_per_bias_sigma[POSITION],
+            track_frame_position_shift_per_bias_sigma_m=track.state_shift_per_bias_sigma[POSITION],
             yaw_var_rad2=float(track.P[YAW, YAW]),
             unseen_frames=least,
             stage=_VISIBLE_MARKERS_BY_POSE_SOURCE[poses_by_track[name].source]
@@ -160,7 +160,8 @@ def merge_tracks(
         track_frame_xyz_yaw=merge_xyz_yaw(large.x[order], small.x[order], weights),
         track_frame_velocity_mps=w * large.x[VELOCITY] + (1.0 - w) * small.x[VELOCITY],
         track_frame_position_cov_m2=np.diag(variance[:3]),
-        track_frame_shift_per_bias_sigma_m=w[:, None] * large.state_shift_per_bias_sigma[POSITION]
+        track_frame_position_shift_per_bias_sigma_m=w[:, None]
+        * large.state_shift_per_bias_sigma[POSITION]
         + (1.0 - w[:, None]) * small.state_shift_per_bias_sigma[POSITION],
         yaw_var_rad2=float(variance[3]),
         unseen_frames=least,
@@ -191,7 +192,7 @@ def widen_covariance_for_rival(merged: MergedTarget, rival_state: Array) -> Merg
 READOUT_TIME_SIGMA_IF_UNKNOWN_S = 0.012
 """Standard deviation of a camera's rolling-shutter readout time, s, if the profile does not specify
 it."""
-CORNER_FLOW_SIGMA_FRACTION_ALONG, CORNER_FLOW_SIGMA_FRACTION_ACROSS = 0.05, 0.015
+CORNER_FLOW_SIGMA_FRACTION_ALONG_FLOW, CORNER_FLOW_SIGMA_FRACTION_ACROSS_FLOW = 0.05, 0.015
 """Errors of a corner's motion along and across its direction, as fractions of the motion. They
 arise because the motion was measured one frame earlier."""
 
@@ -199,7 +200,7 @@ arise because the motion was measured one frame earlier."""
 def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[Detection]:
     """Return the detections with their corners moved to where they were at the frame's time, when
     the middle row was exposed. Each corner is moved back by its image velocity
-    (`Detections.flow_pxps`) times the delay of its row relative to the middle row. Markers
+    (`Detections.corner_flow_pxps`) times the delay of its row relative to the middle row. Markers
     without a known image velocity stay unchanged.
 
     If the readout time `setup.readout_s` is None (unknown), the corners are not moved, and
@@ -214,7 +215,7 @@ def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[De
     late = READOUT_TIME_SIGMA_IF_UNKNOWN_S if readout_s is None else readout_s
     out = []
     for d in detections.markers:
-        flow = detections.flow_pxps.get(d.marker)
+        flow = detections.corner_flow_pxps.get(d.marker)
         if flow is None:
             out.append(d)
             continue
@@ -226,7 +227,7 @@ def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[De
         if readout_s is None:
             out.append(replace(d, corner_shift_per_readout_sigma_px=moved_px))
         else:
-            turned_px = CORNER_FLOW_SIGMA_FRACTION_ACROSS * float(np.abs(moved_px).max())
+            turned_px = CORNER_FLOW_SIGMA_FRACTION_ACROSS_FLOW * float(np.abs(moved_px).max())
             cov_px2 = None if d.cov_px2 is None else d.cov_px2 + turned_px**2 * np.eye(8)
             out.append(
                 replace(
@@ -234,7 +235,8 @@ def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[De
                     corners_px=d.corners_px - moved_px,
                     sigma_px=float(np.hypot(d.sigma_px, turned_px)),
                     cov_px2=cov_px2,
-                    corner_shift_per_readout_sigma_px=CORNER_FLOW_SIGMA_FRACTION_ALONG * moved_px,
+                    corner_shift_per_readout_sigma_px=CORNER_FLOW_SIGMA_FRACTION_ALONG_FLOW
+                    * moved_px,
                 )
             )
     return out

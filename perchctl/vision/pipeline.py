@@ -321,7 +321,7 @@ def step_from_detections(
         frames_with_contradicting_markers=disagreeing,
         lock_note=verdict.reason or (SEVERAL_TARGETS_TEXT if detections.target_count > 1 else ""),
         picture_kind=picture_kind,
-        is_foreign_target=verdict.is_foreign_target,
+        is_foreign_target_seen=verdict.is_foreign_target,
     )
     return new, output
 
@@ -433,7 +433,7 @@ def _express_in_level_and_world(
     place_m, yaw_rad = merged.track_frame_xyz_yaw[:3], float(merged.track_frame_xyz_yaw[3])
     position_cov_m2, error_shifts_m = (
         merged.track_frame_position_cov_m2,
-        merged.track_frame_shift_per_bias_sigma_m,
+        merged.track_frame_position_shift_per_bias_sigma_m,
     )
     seen: dict[str, Any] = {"velocity_mps": merged.track_frame_velocity_mps}
     if attitude is not None and is_in_world_frame:

@@ -413,7 +413,7 @@ def pose_covariance(points: WeightedCorners, scored: ScoredPose) -> PoseCovarian
     gain = inverse.dot(B.T)
     chi2 = float(error.dot(weighed))
     growth = max((_CORNER_SIGMA_PRIOR_DOF + chi2) / (_CORNER_SIGMA_PRIOR_DOF + freedom), 0.7)
-    common = gain.dot(points.whitened_shift_per_common_error_sigma)
+    common = gain.dot(points.whitened_corner_shift_per_common_error_sigma)
     noise = inverse if weight is None else gain @ gain.T
     cov = noise * growth + common.dot(common.T)
     curled, twisted = gain.dot(curl).T
@@ -590,7 +590,7 @@ class WeightedCorners:
         sigma_px: standard deviations (n,) of the corners.
         whitening_matrix: matrix (2n, 2n) that transforms the errors of the corners to independent
             errors with unit variance.
-        whitened_shift_per_common_error_sigma: whitened shift of the corners for one standard
+        whitened_corner_shift_per_common_error_sigma: whitened shift of the corners for one standard
             deviation of each error that is common to several corners, one column per error (2n, k).
             These errors are the growth of white over black at all edges, the error of the
             rolling-shutter readout time (`corner_shift_per_readout_sigma_px` of the detections),
@@ -604,7 +604,7 @@ class WeightedCorners:
     image_points_px: Array
     sigma_px: Array
     whitening_matrix: Array
-    whitened_shift_per_common_error_sigma: Array
+    whitened_corner_shift_per_common_error_sigma: Array
     K: Array
     corner_lift_per_sheet_curl_sigma_m: Array
     allows_for_sheet_curl: bool = False
@@ -628,7 +628,7 @@ def compute_corner_weights(
     n, m = len(image_points_px), len(detections)
     W, error_shifts = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
     corners_px = image_points_px.reshape(m, 4, 2)
-    normals = _outward_normals(corners_px)
+    normals = _outward_side_normals(corners_px)
     # If all edges shift by one pixel, a corner moves by one pixel along the normals of both of its
     # sides.
     moved = (normals + normals.take(_PREVIOUS_CORNER_INDICES, axis=1)).reshape(m, 8)
@@ -675,7 +675,7 @@ def compute_corner_weights(
     )
 
 
-def _outward_normals(corners: Array) -> Array:
+def _outward_side_normals(corners: Array) -> Array:
     """Return the outward unit normals (m, 4, 2) of the sides of m quadrilaterals with `corners` (m,
     4, 2), listed clockwise or counterclockwise. Side k runs from corner k to corner k + 1."""
     side = corners.take(_SIDE_END_CORNER_INDICES, axis=1) - corners

@@ -16,8 +16,8 @@ import numpy as np
 
 from perchctl.geometry import Array, is_finite, wrap_rad
 from perchctl.vision.filter import (
-    PRINT_BIASES,
-    TILT_BIASES,
+    PRINT_BIAS_COLUMNS,
+    TILT_BIAS_COLUMNS,
     FilterSetup,
     TrackMeasurement,
     vector_jacobian_wrt_tilt,
@@ -112,14 +112,17 @@ _XYZ_YAW_TO_YAW_XYZ_INDICES = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
 
 
 def target_level_to_world(
-    e_m: Array, e_yaw_rad: float, attitude: VehicleState, setup: PoseSetup
+    gear_to_target_level_m: Array,
+    target_yaw_level_rad: float,
+    attitude: VehicleState,
+    setup: PoseSetup,
 ) -> tuple[Array, float]:
-    """Convert a target's position `e_m` (3,), m, and heading `e_yaw_rad`, which are relative to the
-    gear in the level frame, to the world frame of the state estimate. `attitude` is the vehicle's
-    attitude and position in this frame. Returns the position, m, and the heading, rad."""
-    body_to_target_m = e_m + attitude.R_level_body.dot(setup.gear_body_m)
+    """Convert a target's position (3,), m, relative to the gear, and its heading, rad, from the
+    level frame to the world frame of the state estimate. `attitude` is the vehicle's attitude and
+    position in this frame. Returns the target's position, m, and heading, rad, in the world."""
+    body_to_target_m = gear_to_target_level_m + attitude.R_level_body.dot(setup.gear_body_m)
     position_m = np.asarray(attitude.position_m) + attitude.R_world_level.dot(body_to_target_m)
-    return position_m, wrap_rad(e_yaw_rad + attitude.yaw_rad)
+    return position_m, wrap_rad(target_yaw_level_rad + attitude.yaw_rad)
 
 
 def target_world_to_level(
@@ -168,9 +171,9 @@ def make_track_measurement(
     noise = pose.xyz_yaw_cov.copy()
     noise[:3, :3] -= pose.shift_per_print_error_sigma_m.dot(pose.shift_per_print_error_sigma_m.T)
     shift_per_bias_sigma = np.zeros((4, 4))
-    shift_per_bias_sigma[1:, PRINT_BIASES] = pose.shift_per_print_error_sigma_m
+    shift_per_bias_sigma[1:, PRINT_BIAS_COLUMNS] = pose.shift_per_print_error_sigma_m
     if attitude is not None:
-        shift_per_bias_sigma[1:, TILT_BIASES] = (
+        shift_per_bias_sigma[1:, TILT_BIAS_COLUMNS] = (
             vector_jacobian_wrt_tilt(lever_m) * filter_setup.roll_pitch_bias_sigma_rad
         )
     if is_in_world_frame and attitude is not None:
@@ -198,7 +201,7 @@ def gear_to_target_shift_per_bias_sigma_m(
     minus the effect of the roll and pitch biases on the gear."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     moved = attitude.R_world_level.T.dot(target_world_shift_per_bias_sigma_m)
-    moved[:, TILT_BIASES] -= (
+    moved[:, TILT_BIAS_COLUMNS] -= (
         vector_jacobian_wrt_tilt(gear_level) * filter_setup.roll_pitch_bias_sigma_rad
     )
     return np.asarray(moved)

@@ -212,7 +212,7 @@ _MIN_RIVAL_ROTATION_TO_REPORT_RAD = math.radians(15.0)
 _MAX_LAST_VIEW_AGE_FOR_JUMP_S, _HOVER_SPEED_SIGMA_MPS, _HOVER_ROTATION_SIGMA_RADPS = 0.35, 0.3, 0.5
 # A jump of the state estimate, or a wrong last pose, is accepted as an explanation if it reduces
 # the squared innovation to less than this fraction of its value.
-_MAX_ALTERNATIVE_TO_TRACK_CHI2_RATIO = 0.25
+_MAX_ALTERNATIVE_HYPOTHESIS_CHI2_RATIO = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -445,7 +445,9 @@ def _compute_innovation(
         + R
         + error_shifts @ error_shifts.T
     )
-    return _Innovation(residual, S + np.diag(_unmodelled_yaw_xyz_sigma(_range_m(frame_pose)) ** 2))
+    return _Innovation(
+        residual, S + np.diag(_unmodelled_yaw_xyz_sigma(_camera_to_target_range_m(frame_pose)) ** 2)
+    )
 
 
 def _is_pose_clearly_consistent(
@@ -457,11 +459,11 @@ def _is_pose_clearly_consistent(
     wanted = predict_track(track, frame_pose.t_s, filter_setup)
     residual = frame_pose.measurement.z - wanted.x[MEASURED_ELEMENTS]
     residual[0] = wrap_rad(float(residual[0]))
-    residual /= _unmodelled_yaw_xyz_sigma(_range_m(frame_pose))
+    residual /= _unmodelled_yaw_xyz_sigma(_camera_to_target_range_m(frame_pose))
     return float(residual @ residual) <= _MAX_ACCEPTED_INNOVATION_CHI2
 
 
-def _range_m(frame_pose: FramePose) -> float:
+def _camera_to_target_range_m(frame_pose: FramePose) -> float:
     return math.hypot(*frame_pose.pose.tvec_m.tolist())
 
 
@@ -488,7 +490,7 @@ def _has_state_estimate_jumped(
     dt_s = frame_pose.t_s - lock.track.t_s
     if not frame_pose.is_in_world_frame or dt_s > _MAX_LAST_VIEW_AGE_FOR_JUMP_S:
         return False
-    range_m = _range_m(frame_pose)
+    range_m = _camera_to_target_range_m(frame_pose)
     residual = np.array([wrap_rad(frame_pose.pose.e_yaw_rad - lock.pose.e_yaw_rad), 0.0, 0.0, 0.0])
     residual[1:] = frame_pose.pose.e_m - lock.pose.e_m
     moved_m = math.hypot(_HOVER_SPEED_SIGMA_MPS, _HOVER_ROTATION_SIGMA_RADPS * range_m) * dt_s
@@ -501,7 +503,7 @@ def _has_state_estimate_jumped(
         float((residual * residual / (unclaimed**2 + moved * moved)).sum())
         <= _MAX_ACCEPTED_INNOVATION_CHI2
     )
-    return calm and seen < _MAX_ALTERNATIVE_TO_TRACK_CHI2_RATIO * jumped
+    return calm and seen < _MAX_ALTERNATIVE_HYPOTHESIS_CHI2_RATIO * jumped
 
 
 def _was_previous_pose_wrong(
@@ -516,14 +518,14 @@ def _was_previous_pose_wrong(
         return False
     innovation, unclaimed = (
         _compute_innovation(lock.track_before_last_pose, frame_pose, filter_setup),
-        _unmodelled_yaw_xyz_sigma(_range_m(frame_pose)),
+        _unmodelled_yaw_xyz_sigma(_camera_to_target_range_m(frame_pose)),
     )
     before, now = (
         float(((o / unclaimed) ** 2).sum()) for o in (innovation.yaw_xyz, innovation_yaw_xyz)
     )
     return (
         innovation.squared_mahalanobis <= _MAX_ACCEPTED_INNOVATION_CHI2
-        and before < _MAX_ALTERNATIVE_TO_TRACK_CHI2_RATIO * now
+        and before < _MAX_ALTERNATIVE_HYPOTHESIS_CHI2_RATIO * now
     )
 
 
@@ -552,11 +554,13 @@ def _update_rival(
         abs(float(innovation.yaw_xyz[0])),
         float(innovation.yaw_xyz[3]),
     )
-    has_different_range = farther_m**2 > _MAX_RANGE_DIFFERENCE_SIGMAS**2 * float(innovation.S[3, 3])
+    has_different_range_from_target = farther_m**2 > _MAX_RANGE_DIFFERENCE_SIGMAS**2 * float(
+        innovation.S[3, 3]
+    )
     where = f"{innovation.distance_m:.2f} m away from it"
     if turned_rad > _MIN_RIVAL_ROTATION_TO_REPORT_RAD:
         where += f" and rotated by {math.degrees(turned_rad):.0f} deg"
-    if has_different_range:
+    if has_different_range_from_target:
         where = f"{abs(farther_m):.2f} m {'above' if farther_m > 0.0 else 'below'} it"
         where += ", or it has another size"
     return RivalTrack(
@@ -565,7 +569,7 @@ def _update_rival(
         first_seen_at_s=frame_pose.t_s,
         seen_frame_count=1,
         frames_with_both_markers=int(frame_pose.has_both_markers),
-        has_different_range=has_different_range,
+        has_different_range_from_target=has_different_range_from_target,
         relative_position_text=where,
     )
 
@@ -591,7 +595,7 @@ def _is_rival_accepted_as_target(
     # A target whose position is outside the image may still be there.
     return (
         (frame_pose.is_locked_target_in_view or unseen_s >= 2.0 * MIN_RIVAL_DURATION_TO_LOCK_S)
-        and not rival.has_different_range
+        and not rival.has_different_range_from_target
         and rival.frames_with_both_markers >= MIN_RIVAL_FRAMES_TO_LOCK
         and unseen_s >= MIN_RIVAL_DURATION_TO_LOCK_S
     )
@@ -623,7 +627,7 @@ def _is_rival_likely_target(lock: TargetLock, rival: RivalTrack, frame_pose: Fra
 
 
 # Weight of a new frame in the running mean of the squared errors.
-_MOTION_ERROR_SMOOTHING_FACTOR = 0.1
+_NEW_MOTION_ERROR_WEIGHT = 0.1
 
 
 def predict_corners(
@@ -685,7 +689,7 @@ def update_last_pose(
         for displacement_m in _camera_displacements_m(then, attitude, setup)
     ]
     by_place, by_speed = (
-        old + _MOTION_ERROR_SMOOTHING_FACTOR * (float(new.dot(new)) - old)
+        old + _NEW_MOTION_ERROR_WEIGHT * (float(new.dot(new)) - old)
         for old, new in zip(previous.motion_errors, residual, strict=True)
     )
     return LastPose(pose, attitude, MotionErrors(by_place, by_speed))

@@ -182,13 +182,13 @@ class Detection:
 class EdgeShift:
     """Common shift of all black-white edges of an image, due to blooming or gamma.
 
-    `white_growth_px` is the distance by which each edge is displaced from the white side
+    `white_growth_per_edge_px` is the distance by which each edge is displaced from the white side
     to the black side; if positive, a marker's black square looks smaller than it is, by twice this
     distance in width. `sigma_px` is the standard deviation of this distance, and `age_frames` the
     number of frames since it was measured.
     """
 
-    white_growth_px: float
+    white_growth_per_edge_px: float
     sigma_px: float
     age_frames: int = 0
 
@@ -204,7 +204,7 @@ class Detections:
             image.
         target_count: number of complete targets, with both markers, that a search of the image
             found; 0 if there was no search.
-        flow_pxps: image velocity of each marker's corners since the previous detections,
+        corner_flow_pxps: image velocity of each marker's corners since the previous detections,
             px/s: one velocity per corner, (4, 2), or one for all four corners, (2,). Empty if
             unknown.
         edge_shift: common shift of all black-white edges of the image; None if unknown.
@@ -216,7 +216,7 @@ class Detections:
     small: Detection | None = None
     is_mirrored_marker_seen: bool = False
     target_count: int = 0
-    flow_pxps: dict[MarkerName, Array] = field(default_factory=dict)
+    corner_flow_pxps: dict[MarkerName, Array] = field(default_factory=dict)
     edge_shift: EdgeShift | None = None
 
     def get(self, marker: MarkerName) -> Detection | None:
@@ -381,8 +381,8 @@ class MotionErrors(NamedTuple):
     for the motion computed from velocity times time. An error is the angle, seen from the camera,
     between the predicted and the measured direction of the target."""
 
-    position_based_mean_squared_error_rad2: float = 0.0
-    velocity_based_mean_squared_error_rad2: float = 0.0
+    position_based_mean_squared_bearing_error_rad2: float = 0.0
+    velocity_based_mean_squared_bearing_error_rad2: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -425,7 +425,7 @@ class RivalTrack:
         first_seen_at_s: time of the first frame that showed the rival.
         seen_frame_count, frames_with_both_markers: number of frames that showed the rival, and
             number of frames that showed both of its markers.
-        has_different_range: True if the rival's z, which is its range from a
+        has_different_range_from_target: True if the rival's z, which is its range from a
             camera that looks straight up, differs significantly from the target's.
         relative_position_text: the rival's position relative to the target, in words.
     """
@@ -435,7 +435,7 @@ class RivalTrack:
     first_seen_at_s: float
     seen_frame_count: int
     frames_with_both_markers: int
-    has_different_range: bool
+    has_different_range_from_target: bool
     relative_position_text: str
 
 
@@ -536,7 +536,7 @@ class PipelineOutput:
         picture_kind: whether the image is a whole frame, interlaced (``woven``) or a field.
         lock_note: why this frame's pose was rejected, or accepted at an unexpected position, or
             that the frame shows several targets; otherwise empty.
-        is_foreign_target: True if the pose was rejected because, judged by its position, it
+        is_foreign_target_seen: True if the pose was rejected because, judged by its position, it
             shows another vehicle's target.
     """
 
@@ -547,7 +547,7 @@ class PipelineOutput:
     frames_with_contradicting_markers: int = 0
     picture_kind: PictureKind = "whole"
     lock_note: str = ""
-    is_foreign_target: bool = False
+    is_foreign_target_seen: bool = False
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from perchctl.mission.belief.contact import (
     IMU_SHOWS_SUPPORT,
     MIN_PRESS_TO_HOVER_THRUST_RATIO,
     TARGET_CONTACT,
-    is_pressing,
+    is_pressing_against_surface,
 )
 from perchctl.profile import Profile
 from perchctl.values import replace
@@ -127,7 +127,7 @@ def test_more_thrust_than_hovering_takes_is_the_same_everywhere(thrust: float) -
         TARGET_CONTACT in b.condition_start_times_s,
         CLIMB_BLOCKED in b.condition_start_times_s,
         IMU_SHOWS_SUPPORT in b.condition_start_times_s,
-        is_pressing(b),
+        is_pressing_against_surface(b),
     ]
     assert found == [thrust >= MIN_PRESS_TO_HOVER_THRUST_RATIO] * 4
 
@@ -145,4 +145,4 @@ def test_the_end_of_a_raw_press_counts_only_while_one_is_flown(
         commanded_raw_thrust=commanded_raw_thrust,
     )
     b = observing(pressing, touching(thrust=59_500.0), raw).belief
-    assert is_pressing(b) is presses
+    assert is_pressing_against_surface(b) is presses

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import ImuMotion, Observation, OperatorRequest, Phase, PlannerState
 from perchctl.mission.belief.belief import (
-    MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S,
+    MAX_VELOCITY_CORRECTION_AGE_BEYOND_CAMERA_LATENCY_S,
     MIN_SPEED_GAINED_IN_GUST_MPS,
 )
 from perchctl.mission.belief.reckoning import DeadReckoning
@@ -189,7 +189,10 @@ def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked
     assert (flight.state.phase is Phase.LANDING) is (gained_mps > MIN_SPEED_GAINED_IN_GUST_MPS)
     if flight.state.phase is Phase.LANDING:
         assert flight.state.transition_name == "position-lost"
-        assert flight.ticks[-1].t_s - BEGIN_S >= 0.1 + MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S
+        assert (
+            flight.ticks[-1].t_s - BEGIN_S
+            >= 0.1 + MAX_VELOCITY_CORRECTION_AGE_BEYOND_CAMERA_LATENCY_S
+        )
         assert isinstance(flight.command, RawThrust)
         assert flight.command.pitch_rad * ahead_g <= 1e-3
         assert flight.command.roll_rad * aside_g >= -1e-3

@@ -20,7 +20,7 @@ from perchctl.vision.filter import (
     MEASURED_ELEMENTS,
     POSITION,
     RATE_ELEMENTS,
-    TILT_BIASES,
+    TILT_BIAS_COLUMNS,
     VELOCITY,
     VX,
     YAW,
@@ -281,7 +281,7 @@ def test_the_consider_term_is_what_a_wrong_attitude_does(
             xyz_yaw_cov=1e-6 * np.eye(4),
         )  # fmt: skip
         found = make_track_measurement(pose, attitude, in_world, constants, setup.pose_setup)
-        return found.z, found.yaw_xyz_shift_per_bias_sigma[:, TILT_BIASES]
+        return found.z, found.yaw_xyz_shift_per_bias_sigma[:, TILT_BIAS_COLUMNS]
 
     (z, tilt), (moved, _) = measured(true), measured(wrong)
     expected = tilt @ np.array(bias_rad) / math.radians(0.3)

@@ -36,7 +36,7 @@ from perchctl.vision import (
     square_corners,
     step,
 )
-from perchctl.vision.filter import PRINT_BIASES, make_filter_setup
+from perchctl.vision.filter import PRINT_BIAS_COLUMNS, make_filter_setup
 from perchctl.vision.merge import are_marker_positions_inconsistent
 from perchctl.vision.pose import target_normal_cam
 from perchctl.vision.target_selection import make_track_measurement
@@ -336,7 +336,7 @@ def test_the_print_s_errors_are_no_noise_of_a_measurement() -> None:
     assert known.R is not None
     assert told.R is not None
     assert np.allclose(known.R, told.R, rtol=1e-6, atol=1e-15)
-    assert np.linalg.norm(told.yaw_xyz_shift_per_bias_sigma[1:, PRINT_BIASES]) > 0.02 * 0.3
+    assert np.linalg.norm(told.yaw_xyz_shift_per_bias_sigma[1:, PRINT_BIAS_COLUMNS]) > 0.02 * 0.3
 
 
 # --- The spread that a picture's pose claims is what it errs by --------------------------------

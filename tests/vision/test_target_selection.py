@@ -150,11 +150,11 @@ def test_another_s_is_refused_with_the_reason_until_the_own_comes_into_view() ->
         output = flown.at(beyond_m, BOTH_READ_M)
         assert output.detections.large is not None
         assert output.target is None
-        assert output.is_foreign_target
+        assert output.is_foreign_target_seen
         assert "0.50 m from target.expected_xy_m is ignored" in output.lock_note
     outputs = list(flown.along(beyond_m, between_both(0.5), BOTH_READ_M, 20))
     assert place(outputs[-1]) == pytest.approx(OWN_M, abs=0.02)
-    assert not outputs[-1].is_foreign_target
+    assert not outputs[-1].is_foreign_target_seen
     places = [p for p in map(place, outputs) if p is not None]
     assert all(p == pytest.approx(OWN_M, abs=0.02) for p in places)
 

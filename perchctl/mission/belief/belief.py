@@ -30,7 +30,7 @@ from perchctl.vehicle import Telemetry
 ESTIMATE_SETTLING_TIME_AFTER_POSITIONS_RETURN_S = 0.5
 """Time that the state estimate needs to converge once positions return after a gap, s. Smaller: the
 estimate is trusted before it has converged."""
-MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S = 0.13
+MAX_VELOCITY_CORRECTION_AGE_BEYOND_CAMERA_LATENCY_S = 0.13
 """Largest age of the newest external position, in addition to the camera's latency, at which it
 still corrects the estimated velocity, s: four picture intervals at 30 per second, so three lost
 pictures make no difference. Larger: `is_estimate_missing_gust` detects an impact later."""
@@ -38,7 +38,7 @@ MIN_SPEED_GAINED_IN_GUST_MPS = 0.2
 """Lateral speed, gained without a sighting, above which the cause must be an impact or gust, m/s;
 flights without a fault show 0.06 m/s. Larger: an impact goes unnoticed. Smaller: an attitude error
 counts as an impact."""
-GUST_SPEED_THRESHOLD_PER_LATENCY_SIGMA_MPS2 = 2.0
+GUST_SPEED_THRESHOLD_INCREASE_PER_LATENCY_SIGMA_MPS2 = 2.0
 """Increase of `MIN_SPEED_GAINED_IN_GUST_MPS`, in m/s per second of the latency's standard
 deviation; the increase is necessary because the vehicle oscillates if pictures are 0.1 s later than
 assumed. Larger: with an uncertain latency, impacts go unnoticed."""
@@ -274,10 +274,10 @@ class Belief:
     def is_estimated_velocity_being_corrected(self) -> bool:
         """True while the newest external position still corrects the estimated velocity: it is
         older than the camera's latency by at most
-        `MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S`."""
+        `MAX_VELOCITY_CORRECTION_AGE_BEYOND_CAMERA_LATENCY_S`."""
         return (
             self.position_correction_age_s
-            <= self.camera_latency_s + MAX_POSITION_AGE_BEYOND_CAMERA_LATENCY_S
+            <= self.camera_latency_s + MAX_VELOCITY_CORRECTION_AGE_BEYOND_CAMERA_LATENCY_S
         )
 
     @cached_property
@@ -294,7 +294,7 @@ class Belief:
             return False
         least_mps = (
             MIN_SPEED_GAINED_IN_GUST_MPS
-            + GUST_SPEED_THRESHOLD_PER_LATENCY_SIGMA_MPS2 * self.obs.camera_latency_sigma_s
+            + GUST_SPEED_THRESHOLD_INCREASE_PER_LATENCY_SIGMA_MPS2 * self.obs.camera_latency_sigma_s
         )
         return (
             math.hypot(*self.dead_reckoning.recent_imu_minus_estimate_velocity_world_xy_mps)

@@ -9,7 +9,7 @@ vehicle. The vehicle's position and its maneuver then distinguish the magnet fro
 both from another object.
 
 One threshold decides whether the thrust exceeds hover thrust (`is_thrust_above_hover`). A vehicle
-at rest with that thrust is pressing (`is_pressing`):
+at rest with that thrust is pressing (`is_pressing_against_surface`):
 against the target if it is at the target's height (`TARGET_CONTACT`), against an obstacle if the
 setpoint is above the vehicle (`CLIMB_BLOCKED`), and, if its position is unknown, against an unknown
 object (`IMU_SHOWS_SUPPORT`).
@@ -73,11 +73,11 @@ MIN_CLIMB_RATE_AT_FULL_THRUST_MPS = 0.2
 """Climb rate that any vehicle with enough thrust to hover soon exceeds at full thrust, m/s: at full
 thrust, the weakest vehicles that can perch take off at 0.3 to 0.5 m/s. Larger: such a vehicle lands
 at once. Smaller: a vehicle that only the ground effect lifts rises further before it sinks."""
-MAX_HOVER_SPEED_MPS = 0.3
+MAX_SPEED_TO_ACCEPT_HOVER_THRUST_MPS = 0.3
 """Largest speed at which the present thrust counts as hover thrust, m/s."""
-MAX_HOVER_CLIMB_RATE_MPS = 0.27
+MAX_CLIMB_RATE_TO_ACCEPT_HOVER_THRUST_MPS = 0.27
 """Largest vertical speed at which the present thrust counts as hover thrust, m/s."""
-MAX_SPECIFIC_FORCE_DEVIATION_IN_HOVER_G = 0.1
+MAX_SPECIFIC_FORCE_DEVIATION_TO_ACCEPT_HOVER_THRUST_G = 0.1
 """Largest deviation of the specific force from 1 g at which the present thrust counts as hover
 thrust, g."""
 MAX_HEIGHT_DRIFT_RATE_IN_PRESS_MPS = 0.1
@@ -96,7 +96,7 @@ DECK_POSITION_SIGMA_ADDED_BY_IMPACT_M = 0.002
 """Uncertainty that the impact on the ceiling adds to a position from a deck, m."""
 DECK_POSITION_SIGMA_GROWTH_MPS = 0.01
 """Rate at which the uncertainty of a position from a deck grows without a sighting, m/s."""
-MAX_HEIGHT_ESTIMATE_DRIFT_UP_DURING_SLIP_M = 0.02
+MAX_UPWARD_HEIGHT_DRIFT_DURING_SLIP_M = 0.02
 """Largest upward drift of the estimated height despite which a slip is still detected, m."""
 MIN_HEIGHT_LOSS_TO_ACCEPT_FLOOR_M = 0.1
 """Height loss beyond which a descending vehicle counts as having come down, m."""
@@ -195,7 +195,7 @@ def _dead_reckoned_gear_to_target(b: Belief) -> GearToTargetDistance:
     return GearToTargetDistance(math.hypot(*dead_reckoning.gear_to_target_world_xy_m), sigma_m)
 
 
-def gear_to_target_at_last_touch(b: Belief) -> GearToTargetDistance | None:
+def valid_gear_to_target_at_last_contact(b: Belief) -> GearToTargetDistance | None:
     """Return the gear's distance from the target's axis at the last touch, while the vehicle
     retreats from an attempt (RECOVER). None in all other maneuvers, with a fresh sighting, before
     the first touch, or once motion capture shows that the vehicle is more than
@@ -217,11 +217,11 @@ def gear_to_target_at_last_touch(b: Belief) -> GearToTargetDistance | None:
     return b.gear_to_target_at_last_contact
 
 
-def gear_to_target_at_last_touch_or_now(b: Belief) -> GearToTargetDistance:
+def gear_to_target_at_last_contact_or_now(b: Belief) -> GearToTargetDistance:
     """Return the gear's distance from the target's axis at the last touch, while the vehicle
-    retreats from an attempt (`gear_to_target_at_last_touch`), otherwise the present distance
-    (`current_gear_to_target`)."""
-    return gear_to_target_at_last_touch(b) or current_gear_to_target(b)
+    retreats from an attempt (`valid_gear_to_target_at_last_contact`), otherwise the present
+    distance (`current_gear_to_target`)."""
+    return valid_gear_to_target_at_last_contact(b) or current_gear_to_target(b)
 
 
 def contact_height_tolerance_m(b: Belief) -> float:
@@ -266,10 +266,11 @@ def max_press_thrust(profile: Profile) -> float:
 
 def is_flying_at_hover_thrust(b: Belief) -> bool:
     """True if the vehicle flies so quietly that its present thrust is hover thrust: speed, climb
-    rate and specific force are within `MAX_HOVER_SPEED_MPS`, `MAX_HOVER_CLIMB_RATE_MPS` and
-    `MAX_SPECIFIC_FORCE_DEVIATION_IN_HOVER_G` of those in hover, the motors are neither off nor
-    saturated, and nothing blocks a climb. False without fresh telemetry or a valid position. The
-    thrust is not compared with the estimated hover thrust."""
+    rate and specific force are within `MAX_SPEED_TO_ACCEPT_HOVER_THRUST_MPS`,
+    `MAX_CLIMB_RATE_TO_ACCEPT_HOVER_THRUST_MPS` and
+    `MAX_SPECIFIC_FORCE_DEVIATION_TO_ACCEPT_HOVER_THRUST_G` of those in hover, the motors are
+    neither off nor saturated, and nothing blocks a climb. False without fresh telemetry or a valid
+    position. The thrust is not compared with the estimated hover thrust."""
     tel, setpoint = b.telemetry, b.command_history.setpoint
     vz = tel.velocity_mps[2]
     stuck = (
@@ -283,9 +284,9 @@ def is_flying_at_hover_thrust(b: Belief) -> bool:
         and MIN_POSSIBLE_HOVER_THRUST
         <= tel.thrust
         < MIN_SATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
-        and b.speed_mps < MAX_HOVER_SPEED_MPS
-        and abs(vz) < MAX_HOVER_CLIMB_RATE_MPS
-        and abs(tel.acc_z_g - 1.0) < MAX_SPECIFIC_FORCE_DEVIATION_IN_HOVER_G
+        and b.speed_mps < MAX_SPEED_TO_ACCEPT_HOVER_THRUST_MPS
+        and abs(vz) < MAX_CLIMB_RATE_TO_ACCEPT_HOVER_THRUST_MPS
+        and abs(tel.acc_z_g - 1.0) < MAX_SPECIFIC_FORCE_DEVIATION_TO_ACCEPT_HOVER_THRUST_G
         and not stuck
     )
 
@@ -322,7 +323,7 @@ def is_thrust_above_hover(b: Belief) -> bool:
     return b.telemetry.thrust >= least
 
 
-def is_pressing(b: Belief) -> bool:
+def is_pressing_against_surface(b: Belief) -> bool:
     """True if the thrust exceeds hover thrust (`is_thrust_above_hover`), the estimated vertical
     speed is at most `MAX_MOTIONLESS_CLIMB_RATE_MPS` in either direction, and the vehicle is too
     high to be on the ground."""
@@ -339,7 +340,7 @@ def is_pressing(b: Belief) -> bool:
 def is_slipping_off_contact(b: Belief) -> bool:
     """True if the vehicle is sinking faster than `complete.slip_mps` after a contact, and either
     its estimated height is not above the height of the contact (within
-    `MAX_HEIGHT_ESTIMATE_DRIFT_UP_DURING_SLIP_M`), or the accelerometer reads less than
+    `MAX_UPWARD_HEIGHT_DRIFT_DURING_SLIP_M`), or the accelerometer reads less than
     `complete.slip_acc_g`, or the position is not valid. False if no contact is recorded."""
     complete, tel = b.profile.planner.complete, b.telemetry
     if b.vehicle_world_z_at_last_contact_m is None or not b.is_sinking(complete.slip_mps):
@@ -347,7 +348,7 @@ def is_slipping_off_contact(b: Belief) -> bool:
     above_m = tel.position_m[2] - b.vehicle_world_z_at_last_contact_m
     return (
         not b.is_position_valid
-        or above_m < MAX_HEIGHT_ESTIMATE_DRIFT_UP_DURING_SLIP_M
+        or above_m < MAX_UPWARD_HEIGHT_DRIFT_DURING_SLIP_M
         or tel.acc_z_g < complete.slip_acc_g
     )
 
@@ -658,11 +659,14 @@ def find_support(b: Belief) -> Support:
 
 
 def _find_what_vehicle_hangs_on(b: Belief) -> Support:
-    touched, radius_m = gear_to_target_at_last_touch(b), b.profile.planner.perch.contact_xy_m
+    touched, radius_m = (
+        valid_gear_to_target_at_last_contact(b),
+        b.profile.planner.perch.contact_xy_m,
+    )
     was_near = touched is not None and max(touched.distance_xy_m, touched.sigma_m) <= radius_m
     if was_near or is_gear_certainly_in_magnet_reach(b):
         return Support.MAGNET
-    gear_to_target = gear_to_target_at_last_touch_or_now(b)
+    gear_to_target = gear_to_target_at_last_contact_or_now(b)
     is_off_axis = gear_to_target.distance_xy_m - 2.0 * gear_to_target.sigma_m > radius_m
     is_below = touched is None and b.target.gear_to_target_z_m > contact_height_tolerance_m(b)
     return Support.HELD_BY_OTHER_OBJECT if is_off_axis or is_below else Support.UNKNOWN

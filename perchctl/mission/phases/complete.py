@@ -7,7 +7,7 @@ from perchctl.mission.belief.contact import (
     MAGNET_HOLDS_VEHICLE,
     MOTORS_OFF_AS_COMMANDED,
     MOTORS_OFF_DWELL_S,
-    gear_to_target_at_last_touch_or_now,
+    gear_to_target_at_last_contact_or_now,
     has_slipped_off_contact,
 )
 from perchctl.mission.belief.maneuver import Maneuver
@@ -37,7 +37,9 @@ def enter_complete(state: PlannerState, previous_context: Context) -> PlannerSta
     belief = replace(
         state.belief,
         vehicle_world_z_at_last_contact_m=previous_context.telemetry.position_m[2],
-        gear_to_target_at_last_contact=gear_to_target_at_last_touch_or_now(previous_context.belief),
+        gear_to_target_at_last_contact=gear_to_target_at_last_contact_or_now(
+            previous_context.belief
+        ),
     )
     return replace(state, belief=belief, weight_transfer_began_at_s=None)
 

@@ -625,7 +625,7 @@ def extrapolate_corners(previous: Detections | None, t_s: float) -> dict[MarkerN
     moves = 0.0 < gap_s <= _MAX_MARKER_FLOW_AGE_S
     corners: dict[MarkerName, Array] = {}
     for d in previous.markers:
-        flow = previous.flow_pxps.get(d.marker)
+        flow = previous.corner_flow_pxps.get(d.marker)
         corners[d.marker] = d.corners_px + (flow * gap_s if moves and flow is not None else 0)
     return corners
 
@@ -645,7 +645,7 @@ def add_marker_flow(current: Detections, previous: Detections | None) -> Detecti
     if not flow:
         return current
     mean = _MEAN_OF_FOUR_WEIGHTS @ next(iter(flow.values()))
-    return replace(current, flow_pxps=dict.fromkeys(MARKERS, mean) | flow)
+    return replace(current, corner_flow_pxps=dict.fromkeys(MARKERS, mean) | flow)
 
 
 # --- Photometric fits for markers that the edge fit measured poorly or missed ---

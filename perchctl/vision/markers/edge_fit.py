@@ -305,10 +305,10 @@ def _refine_corners_by_lines_once(
     applied = shift or EdgeShift(
         0.0, edge_shift_prior_sigma_px(float(outer_edges.profile_greys[:, :, -1].mean()))
     )
-    if applied.white_growth_px != 0.0:
+    if applied.white_growth_per_edge_px != 0.0:
         line_nx_ny_c = line_nx_ny_c.copy()
         line_nx_ny_c[:, 2] += _line_normal_outward_signs(markers, line_nx_ny_c) * (
-            applied.white_growth_px / markers.px_per_normalised_unit
+            applied.white_growth_per_edge_px / markers.px_per_normalised_unit
         )
     corners = _intersect_adjacent_sides(line_nx_ny_c)
     if not is_finite(corners):
@@ -470,7 +470,7 @@ def _measure_edge_shift(
     ) ** 2
     prior = prior_px**2
     return EdgeShift(
-        white_growth_px=shift * prior / (prior + variance),
+        white_growth_per_edge_px=shift * prior / (prior + variance),
         sigma_px=(1.0 / variance + 1.0 / prior) ** -0.5,
     )
 

@@ -199,7 +199,7 @@ def _make_edge_normal_equations(
     # The standard deviation of an edge is not known yet, so it is assumed to be a tenth of a pixel.
     certain = (0.1 / edge_shift_prior.sigma_px) ** 2
     N[8, 8] += certain
-    g[8] += certain * edge_shift_prior.white_growth_px
+    g[8] += certain * edge_shift_prior.white_growth_per_edge_px
     N[range(8), range(8)] += 1e-6
     return A, N, g
 
