@@ -52,15 +52,16 @@ def homography_to_centred_square(corners: Array) -> Array:
 
 
 def apply_homography(H: Array, points: Array) -> Array:
-    """Return the points (..., 2) mapped by the homography `H` (3, 3)."""
+    """Map points (..., 2) with the homography `H` (3, 3) and return them in the same shape."""
     images = cv2.perspectiveTransform(points.reshape(-1, 1, 2), H)
     return np.asarray(images, dtype=np.float64).reshape(points.shape)
 
 
 def corners_jacobian_wrt_homography_increment(homography: Array) -> Array:
-    """Return the Jacobian (8, 8) of the corners (x0, y0, x1, y1, ...) of the centred square (-1 to
-    1), projected by `homography` (3, 3), with respect to the `homography_increment` of
-    `increment_homography`."""
+    """Return the Jacobian (8, 8) of the four corners of the centred square (-1 to 1) after
+    projection by `homography` (3, 3). Its rows are the coordinates x0, y0, x1, y1, ... of the
+    projected corners, and its columns the eight elements of the increment P in homography (I + P),
+    row by row without the last one (see `increment_homography`), at P = 0."""
     q = _CENTRED_SQUARE_HOMOGENEOUS.dot(homography.T)
     x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
     A = (homography[:2, :2] - x[:, :, None] * homography[2, :2]) / d
@@ -68,9 +69,9 @@ def corners_jacobian_wrt_homography_increment(homography: Array) -> Array:
 
 
 def increment_homography(H: Array, homography_increment: Array) -> Array:
-    """Return H (I + P), for a homography `H` (3, 3), scaled so that its last element is 1.
+    """Return the homography H (I + P), (3, 3), scaled so that its last element is 1.
     `homography_increment` (8,) contains the first eight elements of P (3, 3), row by row; the last
-    one is 0. P is composed with H, not added to it."""
+    element of P is 0."""
     H = H @ np.array(
         [
             [1 + homography_increment[0], homography_increment[1], homography_increment[2]],
@@ -104,9 +105,9 @@ def signed_double_area_clockwise(corners: Array) -> Array:
 def is_inside_image(
     corners_px: Array, image_shape: tuple[int, ...], margin_px: float = 0.0
 ) -> bool:
-    """True if all corners (4, 2) are at least `margin_px` inside the border of an image with the
-    given `image_shape` (h, w). With a negative margin, corners may be outside the image by that
-    distance. False if a corner is NaN."""
+    """True if all corners (4, 2) px are at least `margin_px` inside the border of an image with the
+    given `image_shape` (h, w). If `margin_px` is negative, corners may be outside the image, but by
+    no more than its absolute value. False if a corner is NaN."""
     h, w = image_shape[:2]
     right, low = w - 1 - margin_px, h - 1 - margin_px
     # NaN yields False.
@@ -159,20 +160,27 @@ CORNER_SIGMA_FROM_OTHER_MARKER_PX = 0.6
 
 @dataclass(frozen=True, eq=False)
 class RefinedCorners:
-    """A marker's refined corners and their uncertainty (see `Detection`).
+    """A marker's refined corners and their uncertainty. The optional fields keep their default
+    values if the method that refined the corners does not determine them.
 
     Attributes:
-        corners_px, sigma_px, cov_px2, row_jitter_sigma_px: as in `Detection`.
+        corners_px: corners (4, 2), px in the distorted image, in the order of cv2.aruco.
+        sigma_px: standard deviation of each corner coordinate, px.
         are_corners_fitted: True if the corners come from a line fit or a photometric fit; False if
             they come from OpenCV or from the other marker, which is less accurate.
-        removed_edge_shift: how far white has grown over black at all edges of the image (blooming,
-            gamma), measured on this frame's markers or in an earlier frame. The corners are
-            corrected for this growth. None if the growth is unknown; the corners are then not
-            corrected.
-        remaining_edge_shift_sigma_px: standard deviation of the growth of white that remains after
-            the correction.
-        blurriest_side_blur_sigma_px, sharpest_side_blur_sigma_px: standard deviations of the blur
-            of the marker's blurriest and sharpest side.
+        remaining_edge_shift_sigma_px: standard deviation, px, of the growth of white over black
+            that may remain in the corners, after the correction or without it.
+        blurriest_side_blur_sigma_px, sharpest_side_blur_sigma_px: standard deviations of the
+            Gaussian blur, px, of the marker's blurriest side and of its sharpest side.
+        removed_edge_shift: an `EdgeShift`, for which the corners are corrected: the distance in
+            pixels by which white has grown over black at all edges of the image (blooming, gamma),
+            and its standard deviation. It was measured in this frame or in an earlier one. None if
+            the growth is unknown; the corners are then not corrected.
+        cov_px2: covariance (8, 8), px^2 in the image of a pinhole camera, in the order x0, y0, x1,
+            y1, ..., of corners that were inferred from a visible part of the marker; None for
+            corners from other methods.
+        row_jitter_sigma_px: standard deviation of the corners due to the jitter of image rows in
+            analogue video, px.
     """
 
     corners_px: Array
@@ -189,13 +197,14 @@ class RefinedCorners:
 def refine_subpix(
     image: NDArray[np.uint8], raw_corners_px: Array, cells_per_side: int
 ) -> RefinedCorners:
-    """Refine corners (4, 2) px with `cv2.cornerSubPix`. If any corner moves out of its search
-    window, return the raw corners.
+    """Refine the corners (4, 2) of one marker, px in the image, with `cv2.cornerSubPix`. If any
+    corner moves out of its search window, return the raw corners with a larger standard deviation.
 
     Each corner p solves sum grad I(q) grad I(q)' (p - q) = 0 over the pixels q of a window that
-    extends half a cell, 1 to 5 px, to each side. `cells_per_side` includes the border and sets the
-    size of a cell. Blur moves such corners inwards by 0.15 to 0.3 px, and the target then seems too
-    far away. The result's `are_corners_fitted` is therefore False.
+    extends half a cell, 1 to 5 px, to each side. `cells_per_side` is the number of cells along a
+    side of the marker, including the border; it yields the size of a cell. Blur moves the refined
+    corners inwards by 0.15 to 0.3 px, and the target then seems too far away. The result's
+    `are_corners_fitted` is therefore False.
     """
     side_px = float(side_lengths_px(raw_corners_px).min())
     half = int(np.clip(round(0.5 * side_px / cells_per_side), 1, 5))

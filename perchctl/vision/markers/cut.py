@@ -79,8 +79,8 @@ _R_MARKER_DRAWING = np.diag([1.0, -1.0, -1.0])
 def warm_up_truncated_marker_fit(
     patterns: Mapping[MarkerName, MarkerPattern], camera: CameraModel
 ) -> None:
-    """Fill the caches of `fit_truncated_markers` before the flight, so that its first call is
-    fast."""
+    """Fill the caches of `fit_truncated_markers` for these marker patterns and this camera before
+    the flight, so that its first call is fast."""
     (
         _make_target_outline(patterns),
         make_drawing_texture(patterns["large"].drawing),
@@ -93,9 +93,9 @@ def is_target_possibly_truncated(
     image_shape: tuple[int, ...],
     hidden_mask: HiddenMask | None = None,
 ) -> bool:
-    """True if no expected marker is certain to be completely visible: each has a corner that is
-    outside the image or less than `_MAX_EXPECTED_CORNER_ERROR_PX` from its border, or the
-    vehicle's gear hides a part of it. False if no marker is expected.
+    """True if no expected marker is certain to be completely visible: for each of them, a corner
+    is outside the image or close to its border (`_MAX_EXPECTED_CORNER_ERROR_PX`, 40 px), or the
+    vehicle's gear hides a part of the marker. False if no marker is expected.
 
     `expected_corners_px` contains the predicted corners of each marker, (4, 2) px.
     `image_shape` (h, w) is that of the image. `hidden_mask` (h, w) is True for pixels that the
@@ -115,8 +115,8 @@ def can_complete_marker_be_in_view(
     expected_corners_px: Mapping[MarkerName, Array], image_shape: tuple[int, ...]
 ) -> bool:
     """True if at least one expected marker, with corners (4, 2) px, may be completely in an image
-    with the given `image_shape` (h, w): because predictions are uncertain, its corners may be up to
-    `_MAX_EXPECTED_CORNER_ERROR_PX` outside the image."""
+    with the given `image_shape` (h, w). Because predictions are uncertain, a marker counts even if
+    its predicted corners are up to 40 px (`_MAX_EXPECTED_CORNER_ERROR_PX`) outside the image."""
     return any(
         is_inside_image(corners, image_shape, -_MAX_EXPECTED_CORNER_ERROR_PX)
         for corners in expected_corners_px.values()
@@ -131,9 +131,9 @@ def fit_truncated_markers(
     marker, projected from the fitted pose: of the small marker if enough of its edge points were
     found, otherwise of the large one.
 
-    The result is empty if the target has no small marker, if the small marker's cells are smaller
-    than `_MIN_SMALL_MARKER_CELL_PX`, or if the image does not match the target or does not
-    determine its position accurately enough.
+    The result is empty if the target has no small marker, if the small marker's cells are narrower
+    than 8 px (`_MIN_SMALL_MARKER_CELL_PX`) in the image, if the image does not match the target, or
+    if it does not determine the target's position accurately enough.
     """
     image, camera, patterns = (
         detector_input.image,
@@ -250,11 +250,12 @@ def _search_near_pose(
     start: RigidPose, texture: DrawingTexture, coarse_image: CoarseUndistortedImage
 ) -> RigidPose | None:
     """Return the pose near `start` at which the drawing, rendered from `texture`, correlates best
-    with the coarse image; None if the correlation is below `_MIN_COARSE_CORRELATION` everywhere.
+    with the coarse image; None if no pose has a correlation above 0.6 (`_MIN_COARSE_CORRELATION`).
 
-    The search covers `_SEARCH_HALF_WIDTH_NODES` lattice nodes in each direction of the image
-    and the sizes in `_TARGET_IMAGE_SCALE_CANDIDATES`. The rotation is not changed. The search
-    stops at the first size at which the correlation exceeds `_SUFFICIENT_COARSE_CORRELATION`.
+    The search moves the drawing by up to 6 pixels of the coarse image (`_SEARCH_HALF_WIDTH_NODES`)
+    to each side, at the predicted size and at slightly smaller and larger sizes
+    (`_TARGET_IMAGE_SCALE_CANDIDATES`). It does not change the rotation, and stops at the first size
+    with a correlation above 0.95 (`_SUFFICIENT_COARSE_CORRELATION`).
     """
     best, pose, lattice = _MIN_COARSE_CORRELATION, None, coarse_image.lattice
     for growth in _TARGET_IMAGE_SCALE_CANDIDATES:
@@ -281,10 +282,11 @@ def _search_near_pose(
 
 
 def _is_pose_fit_reliable(pose_fit: PoseFit) -> bool:
-    """True if at least `_MIN_FOUND_EDGE_POINT_FRACTION` of the visible edge points were found,
-    their RMS residual is below `_MAX_TRUNCATED_FIT_RMS_RESIDUAL_PX`, and the standard deviation
-    of the translation along its most uncertain direction is below
-    `_MAX_TRANSLATION_SIGMA_HALF_SIDES` (half sides of the large marker)."""
+    """True if enough of the visible edge points were found (at least
+    `_MIN_FOUND_EDGE_POINT_FRACTION` of them), their RMS residual is below
+    `_MAX_TRUNCATED_FIT_RMS_RESIDUAL_PX`, and the standard deviation of the translation along its
+    most uncertain direction is below `_MAX_TRANSLATION_SIGMA_HALF_SIDES`, in half sides of the
+    large marker."""
     spread = math.sqrt(
         max(float(np.linalg.eigvalsh(pose_fit.rotation_translation_cov[3:, 3:])[-1]), 0.0)
     )
@@ -298,10 +300,11 @@ def _is_pose_fit_reliable(pose_fit: PoseFit) -> bool:
 def _project_marker_corners(
     pose_fit: PoseFit, side_to_large_side_ratio: float, camera: CameraModel
 ) -> RefinedCorners | None:
-    """Return the corners of the marker whose side is `side_to_large_side_ratio` times the large
-    marker's, projected from the fitted pose: (4, 2) px in the distorted image, with their
-    covariance (8, 8) in pixels of a pinhole camera. Returns None if a corner is behind the camera
-    or too far from the optical axis for the lens model."""
+    """Project the corners of a marker at the target's centre from the fitted pose. The marker's
+    side is `side_to_large_side_ratio` times that of the large marker. The result contains the
+    corners (4, 2), px in the distorted image, and their covariance (8, 8), px^2 in the image of a
+    pinhole camera without distortion. It is None if a corner is behind the camera or too far from
+    the optical axis for the lens model."""
     r = (
         np.column_stack([side_to_large_side_ratio * CENTRED_SQUARE, np.zeros(4)])
         @ pose_fit.pose.R_cam_drawing.T
@@ -344,16 +347,17 @@ _MIN_VISIBLE_NODES_ON_PAPER = 200  # Minimum number of visible nodes on the pape
 
 @dataclass(frozen=True, eq=False)
 class CoarseLattice:
-    """A regular grid of nodes in normalised image coordinates, at which images are sampled
-    without lens distortion.
+    """A regular grid of nodes (rows, columns) in normalised image coordinates, at which images are
+    sampled without lens distortion. An image is first reduced in size and then sampled at two by
+    two points around each node, whose mean is the grey value of the node.
 
     Attributes:
         first_node_normalised: x and y of the first node, (2,).
         node_spacing_normalised: distance between neighbouring nodes.
         valid_radius_normalised: distance from the optical axis up to which the lens model is used;
             further out, it may map two directions to the same pixel.
-        remap_x_px, remap_y_px: maps for cv2.remap, with the position of each sample in the reduced
-            image.
+        remap_x_px, remap_y_px: maps for cv2.remap (2 rows, 2 columns): x and y of each sample
+            point, px in the reduced image.
         reduced_image_size_px: width and height of the reduced image.
         is_in_image: True for nodes inside the image, (rows, columns).
     """
@@ -369,8 +373,9 @@ class CoarseLattice:
 
 @dataclass(frozen=True, eq=False)
 class CoarseUndistortedImage:
-    """A downsampled, undistorted image: grey values (rows, columns) at the nodes of a lattice.
-    `is_visible` is True for nodes inside the image that the vehicle does not cover."""
+    """A downsampled, undistorted image: grey values `grey` (rows, columns), 0 to 255, at the nodes
+    of a lattice. `is_visible` (rows, columns) is True for nodes that are inside the camera image
+    and not hidden by the vehicle."""
 
     lattice: CoarseLattice
     grey: FloatImage
@@ -431,8 +436,9 @@ def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
 def make_coarse_image(
     image: NDArray[np.uint8], camera: CameraModel, hidden_mask_u8: NDArray[np.uint8] | None = None
 ) -> CoarseUndistortedImage:
-    """Return the image undistorted and downsampled to the nodes of the camera's lattice. Nodes at
-    which `hidden_mask_u8` (h, w) is not zero are marked as not visible."""
+    """Undistort the image (h, w) and downsample it to the nodes of the camera's lattice, about 80
+    across the image. Nodes at which `hidden_mask_u8` (h, w) is not zero are marked as not visible;
+    without a mask, all nodes inside the image are visible."""
     lattice = make_coarse_lattice(camera)
     seen = lattice.is_in_image
     if hidden_mask_u8 is not None:
@@ -464,10 +470,11 @@ def render_drawing(
     lattice: CoarseLattice,
     margin_nodes: int = 0,
 ) -> FloatImage:
-    """Return the whiteness (rows, columns), 0 to 1, of the drawing at the lattice's nodes and at
-    `margin_nodes` additional nodes on each side. `H_normalised_drawing` (3, 3) maps the drawing's
-    coordinates, in half sides of the large marker from the target's centre, to normalised image
-    coordinates; `texture` is the drawing as an image. Beyond the texture, everything is white."""
+    """Return the whiteness, 0 (black) to 1 (white), of the target's drawing at the lattice's nodes
+    and at `margin_nodes` additional nodes on each side: (rows + 2 margin_nodes, columns + 2
+    margin_nodes). `H_normalised_drawing` (3, 3) maps the drawing's coordinates, in half sides of
+    the large marker from the target's centre, to normalised image coordinates; `texture` is the
+    drawing as an image. Beyond the texture, everything is white."""
     step = lattice.node_spacing_normalised / _SAMPLES_PER_LATTICE_NODE_AND_AXIS
     start = (
         lattice.first_node_normalised
@@ -516,7 +523,8 @@ def correlate_drawing(
     nodes on the paper. `H_normalised_drawing` (3, 3) maps the drawing's coordinates, in half sides
     of the large marker from the target's centre, to normalised image coordinates. The brightness
     and the contrast of the drawing, each with a gradient across the image, are first fitted to the
-    image. Both results are 0 if fewer than `_MIN_VISIBLE_NODES_ON_PAPER` nodes are visible."""
+    image. Correlation and contrast are 0 if fewer than 200 visible nodes are on the paper
+    (`_MIN_VISIBLE_NODES_ON_PAPER`)."""
     lattice = coarse_image.lattice
     rows, columns = np.nonzero(coarse_image.is_visible)
     at = lattice.first_node_normalised + lattice.node_spacing_normalised * np.stack(
@@ -562,8 +570,10 @@ class TargetOutline:
         points_half_sides, drawing_normal_to_white: points (n, 2), in half sides of the large marker
             from the target's centre (x right, y down on the paper), and unit normals (n, 2) from
             black to white.
-        line_index: index (n,) of the straight line that each point is on.
-        print_error_sigma_half_sides: standard deviation (n,) of the printed line's position.
+        line_index: number (n,) of the straight line that each point is on; points with the same
+            number are collinear.
+        print_error_sigma_half_sides: standard deviation (n,) of the position of the printed line
+            that each point is on, in half sides of the large marker.
         adjacent_cell_width_half_sides: width (n,) of a cell of the marker that the point is on, in
             half sides of the large marker.
         is_on_small_marker: True for edges of the small marker, (n,).
@@ -664,9 +674,11 @@ class _CellEdge(NamedTuple):
 def _iterate_cell_edges(
     cell_whiteness: Array, side_to_large_side_ratio: float, points_per_edge: int
 ) -> Iterator[_CellEdge]:
-    """Yield each edge between a black cell and a white cell, or the white paper, of a marker with
-    `cell_whiteness` (n, n), 1 = white, sampled at `points_per_edge` points. The marker's side is
-    `side_to_large_side_ratio` times the large marker's."""
+    """Yield the edges between black and white of a marker, one at a time: each side of a cell that
+    has a black cell on one side of it and a white cell, or the white paper around the marker, on
+    the other. `cell_whiteness` (n, n) is 1 for white cells and 0 for black ones, the border
+    included. Each edge is given by `points_per_edge` points. The marker is at the target's centre,
+    and its side is `side_to_large_side_ratio` times that of the large marker."""
     width = 2.0 * side_to_large_side_ratio / len(cell_whiteness)
     s = (
         _EDGE_END_MARGIN_CELLS
@@ -778,13 +790,16 @@ class _EdgePoints:
     """The edge points of a target outline that are in the image.
 
     Attributes:
-        points_px, image_normal_to_white: points (n, 2) px in the distorted image, and unit normals
-            (n, 2) from black to white.
-        normal_motion_jacobian: derivative (n, 7) of each point's motion along its normal with
-            respect to rotation about (rad) and translation along (half sides of the large marker)
-            the camera's axes, and the shift of all edges (px, white over black).
-        px_per_half_side: image scale (n,) across the edge at each point.
-        outline_point_index: index (n,) of each point in the outline.
+        points_px: points (n, 2) px in the distorted image.
+        image_normal_to_white: unit normals (n, 2) of the edges in the distorted image, from black
+            to white.
+        normal_motion_jacobian: derivative (n, 7) of each point's motion along its normal, px, with
+            respect to the rotation of the drawing about its centre (rad) and its translation (half
+            sides of the large marker), each along the camera's x, y, z, and to the growth of white
+            over black at all edges (px).
+        px_per_half_side: image scale (n,) across the edge at each point, in pixels per half side of
+            the large marker.
+        outline_point_index: index (n,) of each point in the arrays of the `TargetOutline`.
     """
 
     points_px: Array
@@ -820,11 +835,12 @@ def fit_pose(
     hidden_mask_u8: NDArray[np.uint8] | None = None,
 ) -> PoseFit | None:
     """Fit the pose of the drawing in the camera frame by Gauss-Newton steps from `start`, so that
-    the projected edges of `outline` match the edges in the image. Pixels at which `hidden_mask_u8`
-    (h, w) is not zero are not used.
+    the projected edges of `outline` match the edges in the distorted image (h, w). Edge points with
+    a profile over pixels at which `hidden_mask_u8` (h, w) is not zero are not used.
 
-    Returns None if fewer than `_MIN_EDGE_POINTS` edge points are in view or found, or if the fit
-    does not converge; the result may still be unreliable (`_is_pose_fit_reliable`).
+    Returns None if fewer than 24 edge points (`_MIN_EDGE_POINTS`) are in view or found, if the
+    robust fit rejects too many of them, or if it does not converge. A result that is not None may
+    still be unreliable: check it with `_is_pose_fit_reliable`.
     """
     pose, pose_and_edge_shift_change_from_start, fit_step, moved_px = (
         start,
@@ -874,12 +890,12 @@ def fit_pose(
 def predict_fit_accuracy(
     pose: RigidPose, outline: TargetOutline, camera: CameraModel
 ) -> PoseFit | None:
-    """Return the result of `fit_pose` for an ideal image of the drawing at `pose` in the camera
-    frame: an edge is found exactly where it is expected at each visible edge point. Return None if
-    fewer than `_MIN_EDGE_POINTS` edge points are in view.
+    """Return the fit that an ideal image of the drawing at `pose` in the camera frame would yield,
+    in which each visible edge point has its edge exactly where it is expected. No image is needed.
+    Return None if fewer than 24 edge points (`_MIN_EDGE_POINTS`) are in view.
 
-    Only the covariance and the point counts are meaningful. The covariance is optimistic because an
-    RMS residual of only 0.03 px is assumed.
+    In the result, only the covariance and the point counts are meaningful. The covariance is
+    optimistic because an RMS residual of only 0.03 px is assumed.
     """
     edge_points = _project_edge_points_in_view(
         pose, outline, _PROFILE_HALF_LENGTH_PER_ITERATION_PX[0], camera.size_px[::-1], camera, None
@@ -961,8 +977,8 @@ def _measure_edge_offsets(
     found (n,).
 
     An edge is the windowed centroid of the grey gradient on a profile that extends
-    `profile_half_lengths_px` (n,) to both sides of the expected position. It counts as found if its
-    contrast is high enough.
+    `profile_half_lengths_px` (n,), but at least 3 px, to both sides of the expected position. It
+    counts as found if its contrast is high enough. Distances are limited to the half length.
     """
     profile_half_lengths_px = np.maximum(profile_half_lengths_px, _MIN_PROFILE_HALF_LENGTH_PX)
     grey = sample_profiles(
@@ -992,10 +1008,11 @@ def _solve_gauss_newton_step(
     is_edge_found: NDArray[np.bool_],
     pose_and_edge_shift_change_from_start: Array,
 ) -> _GaussNewtonStep | None:
-    """Return one Gauss-Newton step with robust (Tukey) weights; None if too few edges were found.
-    `edge_offset_to_white_px` and `is_edge_found`, (n,), are the results of `_measure_edge_offsets`.
-    A prior pulls `pose_and_edge_shift_change_from_start` (7,), the sum of the previous steps,
-    towards zero."""
+    """Return one Gauss-Newton step with robust (Tukey) weights; None if the sum of the weights is
+    too small. `edge_offset_to_white_px` and `is_edge_found`, (n,), are the results of
+    `_measure_edge_offsets`. `pose_and_edge_shift_change_from_start` (7,) is the sum of the previous
+    steps: rotation (rad), translation (half sides of the large marker) and, always 0, edge shift
+    (px). The prior pulls the sum of all steps towards zero."""
     J, weight = edge_points.normal_motion_jacobian, is_edge_found.astype(np.float64)
     variance, step = 1.0, np.zeros(7)
     for _ in range(4):

@@ -50,12 +50,15 @@ class DetectorSetup:
     """Parameters of `detect_markers`, created by `make_detector_setup`.
 
     Attributes:
-        large_and_small_aruco_dictionaries: OpenCV's dictionaries, with one marker each.
+        large_and_small_aruco_dictionaries: one `cv2.aruco.Dictionary` for the large marker and one
+            for the small marker. Each contains only this marker and, if the two can be told apart,
+            its mirror image.
         patterns: appearance of each marker.
         small_to_large_side_ratio: side of the small marker divided by the side of the large one.
         is_line_fit_enabled: if False, markers are only detected by OpenCV and refined by
             `refine_subpix`, without edge fits and photometric fits.
-        static_hidden_mask: True for pixels that the vehicle covers, (h, w).
+        static_hidden_mask: True for pixels that the vehicle hides in every image, (h, w); None if
+            it hides none.
     """
 
     large_and_small_aruco_dictionaries: tuple[Any, Any]
@@ -68,8 +71,9 @@ class DetectorSetup:
 def make_detector_setup(
     config: DetectorConfig, target: TargetConfig, static_hidden_mask: HiddenMask | None = None
 ) -> DetectorSetup:
-    """Return the setup for a target, with dictionaries that only contain the target's markers.
-    `static_hidden_mask` (h, w) is True for pixels that the vehicle covers in every image."""
+    """Return the setup for a target, with dictionaries that only contain the target's markers and
+    their mirror images. `static_hidden_mask` (h, w) is True for pixels that the vehicle hides in
+    every image; None if it hides none."""
     large_bits, small_bits = target.large.bits, target.small.bits
     small_to_large_side_ratio = target.small.side_m / target.large.side_m
     return DetectorSetup(
@@ -105,8 +109,9 @@ def make_detector_setup(
 def make_aruco_detector(
     setup: DetectorSetup, size_px: tuple[int, int], threshold_windows_px: ThresholdWindowRange
 ) -> Any:
-    """Return OpenCV's marker detector for images of `size_px` (width, height). The adaptive
-    threshold averages over windows from the smallest to the largest of `threshold_windows_px`."""
+    """Return a `cv2.aruco.ArucoDetector` for images of `size_px` (width, height), without corner
+    refinement. Its adaptive threshold tries square windows whose sides range from the first to the
+    second of `threshold_windows_px`, px."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.errorCorrectionRate = 1.0  # the limit is then maxCorrectionBits itself
     parameters.minDistanceToBorder = 0
@@ -117,9 +122,9 @@ def make_aruco_detector(
 
 
 def make_quad_detector(setup: DetectorSetup) -> Any:
-    """Return OpenCV's marker detector, configured to find nearly any quadrilateral. It also
-    returns the quadrilaterals whose bits it cannot read. The caller compares them with blurred
-    markers (`find_blurred_marker`)."""
+    """Return a `cv2.aruco.ArucoDetector` that finds nearly any quadrilateral. Its output includes,
+    as rejected candidates, the quadrilaterals whose bits it cannot read; the caller compares them
+    with blurred markers (`find_blurred_marker`)."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = 0
     parameters.polygonalApproxAccuracyRate = _QUAD_DETECTOR_POLYGON_ACCURACY_RATE
@@ -158,9 +163,10 @@ _MEAN_GREY_WEIGHT_IN_FILL = 1e-4
 
 
 def make_hidden_mask(frame: Frame, static_hidden_mask: HiddenMask | None) -> HiddenMask | None:
-    """Return the mask (h, w) of the pixels that the vehicle hides in this frame (True); None if
-    `static_hidden_mask` is None. If the frame is a single field of interlaced video, the mask is
-    extended by the rows that are interpolated from hidden ones."""
+    """Return the mask (h, w), True for pixels that the vehicle hides in this frame; None if
+    `static_hidden_mask` is None. For a single field of interlaced video, it is `static_hidden_mask`
+    extended by the rows that were interpolated from hidden ones, otherwise `static_hidden_mask`
+    itself."""
     if static_hidden_mask is None or frame.picture_kind not in ("top", "bottom"):
         return static_hidden_mask
     return (
@@ -195,9 +201,10 @@ def is_any_marker_part_hidden(
     corners_px: Array,
     reach_half_sides: float = WHITE_BORDER_REACH_HALF_SIDES,
 ) -> bool:
-    """True if the vehicle hides any pixel near the marker with `corners_px` (4, 2) in the image:
-    within the square that extends `reach_half_sides` half sides from its centre. `hidden_mask` (h,
-    w) is True for hidden pixels; without a mask, the result is False."""
+    """True if the vehicle hides any pixel of the marker with `corners_px` (4, 2) in the image or of
+    its surroundings: of a concentric square whose half side is `reach_half_sides` times the
+    marker's. `hidden_mask` (h, w) is True for hidden pixels. The result is False if there is no
+    mask or if a corner is not finite."""
     if hidden_mask is None:
         return False
     h, w = hidden_mask.shape

@@ -107,10 +107,10 @@ def make_profile_centres_and_normals(
     fractions_along_side: Array,
     camera: CameraModel,
 ) -> tuple[Array, Array]:
-    """Return the points, px in the distorted image, at which the profiles cross the sides, and the
-    unit normals at these points; both (rows, n, 2). Seen from the start of a side towards its end,
-    the normals point to the left in the image, which is outwards for a marker with clockwise
-    corners.
+    """Return the points, px in the distorted image, at which the profiles (short scan lines across
+    the edge) cross the sides, and the sides' unit normals at these points, in the same image; both
+    (rows, n, 2). Seen from the start of a side towards its end, the normals point to the left,
+    which is outwards for a marker with clockwise corners.
 
     `side_starts_normalised`, `side_ends_normalised` (rows, 2) are the ends of the sides in
     normalised image coordinates; `fractions_along_side` (rows, n) come from
@@ -138,10 +138,11 @@ def sample_profiles(
     profile_direction: Array,
     profile_half_length_px: Array,
 ) -> Floats:
-    """Return the grey values (rows, n, steps + 1) along the profiles, interpolated bilinearly. Each
-    profile extends from -profile_half_length_px to +profile_half_length_px (rows,) from its
-    `profile_centre_px` (rows, n, 2) along its `profile_direction`, a unit vector (rows, n, 2).
-    Outside the image, the border pixels are repeated.
+    """Return the grey values (rows, n, 17) at 17 equally spaced points on each profile, a short
+    scan line across an edge, interpolated bilinearly. A profile begins `profile_half_length_px`
+    (rows,) before its `profile_centre_px` (rows, n, 2) and ends the same distance behind it, along
+    its `profile_direction`, a unit vector (rows, n, 2), all in the given image. Outside the image,
+    the border pixels are repeated.
 
     The image is converted to float because OpenCV 5 interpolates float images at the exact
     position. For 8-bit images, OpenCV rounds positions to 1/32 px. The rounding error would be as
@@ -235,17 +236,19 @@ def refine_corners_by_lines(
     known_edge_shift: EdgeShift | None = None,
 ) -> list[RefinedCorners | None]:
     """Fit lines to the sides of m markers with corners (m, 4, 2) px in the distorted image and
-    intersect them to get refined corners.
+    intersect them to get refined corners. Return one result for each marker, in the same order.
 
-    `cells_along_border` describes the cells just inside each marker's border. The common shift of
-    all edges (growth of white over black) is measured unless the caller passes `known_edge_shift`
-    and white is not clipped. If a marker's edges are wide or near the ends of the profiles, the fit
-    is repeated with the profiles centred on the edges.
+    `cells_along_border` describes the cells just inside each marker's border. White grows over
+    black at all edges of an image by the same distance, and the corners are corrected for it. This
+    distance is `known_edge_shift` if the caller passes it and white is not clipped; otherwise, it
+    is measured in the image. If the refined corners are so far from the given ones that edges may
+    extend beyond the profiles on which they are located, the fit is repeated from the refined
+    corners.
 
     The result for a marker is None if a side has too few inliers, too little contrast, too large
-    residuals or too much blur, if its cells are smaller than `_MIN_CELL_PX`, or if a corner moved
-    by more than 0.6 cells (and by more than 1.6 px). All results are None if the corners of any
-    marker are degenerate or outside the range of the lens model.
+    residuals or too much blur, if the marker's cells are smaller than 1 px, or if a corner moved by
+    more than 0.6 cells and by more than 1.6 px. All results are None if the corners of any marker
+    are degenerate or outside the range of the lens model.
     """
     found = _refine_corners_by_lines_once(
         image, raw_corners_px, cells_along_border, camera, known_edge_shift
@@ -354,9 +357,10 @@ def _refine_corners_by_lines_once(
 
 
 def _fit_lines(markers: MarkerSides, outer_edges: MeasuredEdges) -> tuple[Array, Array]:
-    """Fit a line to the edge points of each side by weighted total least squares. Return two values
-    for the lines: the coefficients (4m, 3) in normalised coordinates, nx, ny, c with n.x = c and
-    |n| = 1; and the weighted RMS distance, px (4m,), of the points from the lines."""
+    """Fit a line to the edge points of each side of m markers by weighted total least squares.
+    Return the coefficients (nx, ny, c) of each line, (4m, 3), with n.x = c and |n| = 1 in
+    normalised image coordinates, and the weighted RMS distance of the points from each line, px
+    (4m,)."""
     w = outer_edges.weight / np.maximum(outer_edges.weight.dot(_PROFILE_ONES), 1e-9)[:, None]
     x, y = outer_edges.points_normalised[..., 0], outer_edges.points_normalised[..., 1]
     cx, cy = (w * x).dot(_PROFILE_ONES), (w * y).dot(_PROFILE_ONES)
@@ -380,8 +384,9 @@ def _fit_lines(markers: MarkerSides, outer_edges: MeasuredEdges) -> tuple[Array,
 
 
 def _intersect_adjacent_sides(line_nx_ny_c: Array) -> Array:
-    """Return the intersections (m, 4, 2) of side i - 1 and side i of each marker in normalised
-    coordinates; NaN for parallel sides. `line_nx_ny_c` (4m, 3) is the result of `_fit_lines`."""
+    """Return the corners (m, 4, 2) of m markers in normalised image coordinates. Corner i is the
+    intersection of side i - 1 and side i, and NaN if these are parallel. `line_nx_ny_c` (4m, 3)
+    contains nx, ny, c of each side's line n.x = c, as returned by `_fit_lines`."""
     sides = line_nx_ny_c.reshape(-1, 4, 3)
     before = sides.take(PREVIOUS_CORNER, axis=1)
     ax, ay, ac = before[..., 0], before[..., 1], before[..., 2]
@@ -395,8 +400,10 @@ def _intersect_adjacent_sides(line_nx_ny_c: Array) -> Array:
 
 
 def edge_shift_prior_sigma_px(white_grey: float) -> float:
-    """Return the prior standard deviation, px, of the growth of white over black, before any
-    measurement. It is larger if `white_grey`, the grey level of the white paper, is clipped."""
+    """Return the standard deviation, px, of the distance by which white grows over black at each
+    edge of an image in which this distance has not been measured: 0.4 px if `white_grey`, the mean
+    grey level of the white paper, is so high that white is clipped (above 248), otherwise 0.15
+    px."""
     return (
         _EDGE_SHIFT_PRIOR_SIGMA_IF_CLIPPED_PX
         if white_grey > MIN_CLIPPED_GREY
@@ -412,15 +419,17 @@ def _measure_edge_shift(
     rms_residual_px: Array,
     corners_normalised: Array,
 ) -> EdgeShift | None:
-    """Measure how far white has grown over black, px, from the width of the black border of the
-    marker with the widest cells. `line_nx_ny_c` (4m, 3) and `rms_residual_px` (4m,) are the results
-    of `_fit_lines`; `corners_normalised` (m, 4, 2) are the measured corners of the outer edges.
-    Returns None if no inner edges were sampled, and the prior alone if none of them is usable.
+    """Measure by how many pixels white has grown over black, from the width of the black border of
+    the marker with the widest cells. `line_nx_ny_c` (4m, 3) and `rms_residual_px` (4m,) are the
+    results of `_fit_lines`; `corners_normalised` (m, 4, 2) are the intersections of these lines.
+    Returns None if `inner_edges` is None, and a growth of 0 with the prior's standard deviation if
+    no inner edge is usable.
 
-    A growth by d moves the border's outer edges inwards, and its inner edges outwards, by d. On a
-    scale whose unit is the measured outer edge, an inner edge at r then appears at r + d (1 + r).
-    The function solves this equation for d, after a correction for a curled sheet, and combines the
-    result with the prior.
+    A growth by d moves the border's outer edges inwards, and its inner edges outwards, by d. If
+    positions are divided by the measured distance of the outer edges from the marker's centre, an
+    inner edge whose true position is r appears at r + d (1 + r), with d on the same scale. The
+    function solves this equation for d, after a correction for a curled sheet, and combines the
+    result with the prior, whose mean is 0.
     """
     if inner_edges is None:
         return None
@@ -478,11 +487,11 @@ def _measure_edge_shift(
 def _side_ends_outward_bow_px(
     markers: MarkerSides, outer_edges: MeasuredEdges, line_nx_ny_c: Array, rms_residual_px: Array
 ) -> float:
-    """Return the bow of the sides of the marker with the widest cells: by how much, px, their ends
-    are further out than their middles. A parabola is fitted to the distances of each side's edge
-    points from its line, and the bow is the mean over the four sides. The result is 0 if it is not
-    significant compared with the noise. `line_nx_ny_c` (4m, 3) and `rms_residual_px` (4m,) are the
-    results of `_fit_lines`."""
+    """Return by how many pixels the ends of the sides of the marker with the widest cells are
+    further out than their middles, as on a curled sheet; negative if the middles are further out. A
+    parabola is fitted to the distances of each side's edge points from its line, and the result is
+    the mean over the four sides; 0 if it is not significant compared with the noise. `line_nx_ny_c`
+    (4m, 3) and `rms_residual_px` (4m,) are the results of `_fit_lines`."""
     four = slice(4 * markers.widest_cells_marker_index, 4 * markers.widest_cells_marker_index + 4)
     away = (
         np.matmul(outer_edges.points_normalised[four], line_nx_ny_c[four, :2, None])[..., 0]
@@ -555,12 +564,13 @@ def _row_jitter_sigma_px(
     side_normals_x: Sequence[float], line_end_variances_px2: Sequence[float]
 ) -> float:
     """Return the standard deviation of the corners, px, due to row jitter in analogue video; 0 if
-    it is not significant. Jitter only moves vertical sides, so they scatter more than horizontal
-    ones. Its variance is the slope of a line fitted to the four variances as a function of the
-    squared x components of the normals.
+    it is not significant. Jitter displaces image rows horizontally, which moves the edge points of
+    vertical sides only, so they scatter more than those of horizontal sides. The variance due to
+    jitter is the slope of a line fitted to the variances of the four sides as a function of nx^2.
 
-    `side_normals_x` are the x components of the four sides' unit normals. `line_end_variances_px2`
-    are the variances at the ends of the lines fitted to the sides.
+    `side_normals_x` contains nx, the x component of each side's unit normal: 1 or -1 for a vertical
+    side, 0 for a horizontal one. `line_end_variances_px2` contains the variance of the position of
+    each fitted line at its ends.
     """
     upright = [x * x for x in side_normals_x]
     mean = sum(upright) / 4.0
@@ -589,15 +599,17 @@ _SIDE_INDICES = np.arange(4)[:, None]
 
 @dataclass(frozen=True, eq=False)
 class MarkerSides:
-    """The sides of m markers before their edges are measured.
+    """The sides of m markers before their edges are measured. Side k runs from corner k to corner
+    k + 1.
 
     Attributes:
-        raw_corners_px: corners (m, 4, 2) in the image, before any refinement.
-        cells_along_border: the cells just inside each marker's border.
-        corners_normalised: the corners (m, 4, 2) in normalised image coordinates.
-        side_lengths_px: lengths (m, 4).
-        cell_width_across_side_px: width (m, 4) of the border, perpendicular to each side.
-        cell_size_px: width of a cell, the mean over the four sides, (m,).
+        raw_corners_px: corners (m, 4, 2), px in the distorted image, before any refinement.
+        cells_along_border: the cells just inside the border of each of the m markers.
+        corners_normalised: the same corners (m, 4, 2) in normalised image coordinates.
+        side_lengths_px: length of each side (m, 4).
+        cell_width_across_side_px: width (m, 4) of the border, which is one cell wide, perpendicular
+            to each side.
+        cell_size_px: mean side length divided by the number of cells per side, (m,).
         widest_cells_marker_index: index of the marker with the widest cells.
         clockwise_sign: +1 if the corners are in clockwise order, -1 if counterclockwise, (m,).
         px_per_normalised_unit: pixels per unit of normalised coordinates along each side, (4m,).
@@ -616,14 +628,17 @@ class MarkerSides:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredEdges:
-    """Edges measured on n profiles across each side. Each row is one side of a marker.
+    """Edges measured on n profiles (short scan lines) across each side. Each row of the arrays is
+    one side of a marker.
 
     Attributes:
-        profile_greys: grey values along the profiles, from dark to bright, (rows, n, steps + 1).
+        profile_greys: grey values at 17 points along each profile, from its dark end to its bright
+            end, (rows, n, 17).
         window_half_length_px: half length of the window in which the edge is located, (rows,).
-        points_normalised: edge points in normalised image coordinates, (rows, n, 2).
-        weight: robust weight of each point, 0 to 1; 0 for outliers, (rows, n).
-        blur_sigma_px: standard deviation of the edge's blur, (rows,).
+        points_normalised: position of the edge on each profile, in normalised image coordinates,
+            (rows, n, 2).
+        weight: robust weight of each edge point in the line fit, 0 to 1; 0 for outliers, (rows, n).
+        blur_sigma_px: standard deviation of the Gaussian blur of each side's edge, (rows,).
     """
 
     profile_greys: Floats
@@ -636,9 +651,10 @@ class MeasuredEdges:
 def prepare_marker_sides(
     raw_corners_px: Array, cells_along_border: Sequence[CellsAlongBorder], camera: CameraModel
 ) -> MarkerSides | None:
-    """Return the sides of markers with corners (m, 4, 2) px in the distorted image.
-    `cells_along_border` describes the cells just inside each marker's border. Returns None if one
-    of the markers is not a quadrilateral or the lens model has no solution for a corner."""
+    """Return the sides of m markers with corners (m, 4, 2) px in the distorted image.
+    `cells_along_border` describes the cells just inside each marker's border. Returns None if the
+    corners of any marker are degenerate (two coincide, or the area is zero), or if the lens model
+    has no solution for a corner."""
     sides_px = side_lengths_px(raw_corners_px)
     cells = np.array([rim.cells_per_side for rim in cells_along_border], dtype=np.float64)
     corners = undistort_to_normalised(raw_corners_px.reshape(-1, 2), camera).reshape(
@@ -747,9 +763,10 @@ def find_neighbour_edges(
     cells_along_inner_edges: CellsAlongBorder,
     neighbour_distance_px: Array,
 ) -> NeighbourEdges:
-    """Return which parallel edges, one cell further in or out, blur into the measured edges.
-    `fractions_along_side` (rows, n) are the positions of the profiles as fractions of a side;
-    `neighbour_distance_px` (rows,) is the width of a cell across the edge.
+    """Find out at which profiles (scan lines across an edge) a parallel edge, one cell further in
+    or out, blurs into the measured one. `fractions_along_side` (rows, n) contains the positions of
+    the profiles as fractions of a side, 0 to 1; `neighbour_distance_px` (rows,) is the width of a
+    cell across the edge.
 
     The rows are the four outer edges of each marker in `cells_along_border`, then, if there are
     four more, the inner edges of the border of the marker with `cells_along_inner_edges`.
@@ -828,14 +845,16 @@ _MEDIAN_PRESERVING_FILL_PX: Floats = np.where(
 
 @dataclass(frozen=True, eq=False)
 class NeighbourEdges:
-    """Neighbouring edges that blur into a measured edge.
+    """Neighbouring edges, parallel to the measured ones, that blur into them. Each row of the
+    arrays is one side of a marker, with n profiles (scan lines) across it.
 
     Attributes:
-        neighbour_distance_px: distance to a neighbouring edge, the size of a cell across the edge,
-            (rows,).
-        inner_neighbour_count, outer_neighbour_count: number, 0 or 1, of edges with the same
-            contrast one cell further in, and one cell further out, at each profile, (rows, n).
-        is_edge_locatable: False if no edge can be found on the profile, (rows, n).
+        neighbour_distance_px: distance of a neighbouring edge from the measured edge: the width of
+            a cell across the edge, (rows,).
+        inner_neighbour_count, outer_neighbour_count: 1.0 for each profile that has a neighbouring
+            edge, of opposite contrast, one cell further in or one cell further out, and 0.0 for
+            each other profile, (rows, n).
+        is_edge_locatable: False for profiles on which the edge can't be located, (rows, n).
     """
 
     neighbour_distance_px: Array
@@ -858,10 +877,10 @@ def locate_edges(
     the middle of the profile and then a narrow one around the line fitted to all profiles of a row.
 
     Args:
-        profile_greys: grey values (rows, n, steps + 1) along each profile, from
-            -profile_half_length_px (dark) to +profile_half_length_px (bright).
-        profile_half_length_px, window_half_length_px: half length of the profiles and of the
-            windows, (rows,).
+        profile_greys: grey values (rows, n, 17) at 17 equally spaced points on each profile, a
+            scan line across the edge, from its dark end to its bright end.
+        profile_half_length_px, window_half_length_px: half lengths of the profiles and of the wide
+            windows in each row, (rows,).
         neighbours: parallel edges whose blur moves the measured edges; this is corrected.
     """
     profiles = _EdgeProfiles(
@@ -1026,7 +1045,8 @@ def _fit_robust_line(
 ) -> tuple[Floats, Floats]:
     """Fit a straight line to the usable edge offsets of each side, px (rows, n), by least squares
     with Tukey's biweight: starting at the median, the line is fitted `iterations` times. Return the
-    line's offset on each profile, px, and the weights, both (rows, n)."""
+    line's offset on each profile, px (rows, n), and the weight of each profile in the last fit, 0
+    to 1, (rows, n)."""
     line = median_per_row(edge_offsets_px, is_usable)[:, None]
     for _ in range(iterations):
         size = np.abs(edge_offsets_px - line)
@@ -1051,10 +1071,10 @@ def _fit_robust_line(
 def median_per_row(values: Floats, is_usable: NDArray[np.bool_]) -> Floats:
     """Return the median (rows,) of the usable values in each row; 0 for a row without any.
 
-    `values` and `is_usable` have the shape (rows, `PROFILES_PER_SIDE`). Unusable values are
-    replaced by huge ones, negative in even columns and positive in odd columns, which keep the
-    median where it is. If unequal numbers of even and odd columns are unusable, the result is a
-    value near the median.
+    `values` and `is_usable` have the shape (rows, 24), with one column for each profile of a side.
+    For speed, unusable values are not removed but replaced by huge ones, negative in even columns
+    and positive in odd columns. These keep the median where it is if they are equally many. If they
+    are not, the result is a usable value near the median.
     """
     values = np.where(is_usable, values, _MEDIAN_PRESERVING_FILL_PX)
     values.partition(PROFILES_PER_SIDE // 2, axis=1)
