@@ -62,7 +62,7 @@ def edge_fit(file: Path) -> None:
     markers = prepare_marker_sides(_expected(view)[None], [_LARGE.cells_along_border], CAMERA)
     assert markers is not None
     edges, _ = measure_edges(view.image, markers, CAMERA, must_measure_inner_edges=False)
-    used = edges.points_normalised[edges.weight > 0.0]
+    used = edges.edge_points_normalised[edges.edge_point_weight > 0.0]
     at = distort_to_px(used, CAMERA)
     _dots(whole, near, at, "edge on a profile")
     _finish(figure, file, whole, view)
@@ -135,7 +135,7 @@ def cut_view_fit(file: Path) -> None:
     )
     x = X[:, :2] / X[:, 2:]
     at = distort_to_px(
-        x[np.hypot(*x.T) < make_coarse_lattice(CAMERA).valid_radius_normalised], CAMERA
+        x[np.hypot(*x.T) < make_coarse_lattice(CAMERA).valid_lens_radius_normalised], CAMERA
     )
     _dots(whole, near, at[((at > 0.0) & (at < (639.0, 479.0))).all(axis=1)], "edge of the drawing")
     _finish(figure, file, whole, view)

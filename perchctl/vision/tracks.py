@@ -707,7 +707,7 @@ def is_in_view(position_world_m: Array, attitude: VehicleState, setup: PoseSetup
     if (
         tvec_m[2] <= 0.0
         or np.hypot(*tvec_m[:2])
-        > make_coarse_lattice(setup.camera).valid_radius_normalised * tvec_m[2]
+        > make_coarse_lattice(setup.camera).valid_lens_radius_normalised * tvec_m[2]
     ):
         return False
     (at_px,) = project(np.zeros((1, 3)), np.zeros(3), tvec_m, setup.camera)

@@ -150,7 +150,7 @@ def add_missing_marker_corners(
 # 0.55 px, and the target seems too far away.
 
 
-DETECTOR_CORNER_SIGMA_PX = 0.6
+OPENCV_DETECTOR_CORNER_SIGMA_PX = 0.6
 """Standard deviation of corners from OpenCV's detector, px."""
 SUBPIX_CORNER_SIGMA_PX = 0.25
 """Standard deviation of corners from `cv2.cornerSubPix`, px."""
@@ -214,5 +214,5 @@ def refine_subpix(
     moved = points.reshape(4, 2).astype(np.float64)
     moved_px = np.linalg.norm(moved - raw_corners_px, axis=1).max()
     if not np.isfinite(moved_px) or moved_px > half + 1.0:
-        return RefinedCorners(raw_corners_px, DETECTOR_CORNER_SIGMA_PX, False)
+        return RefinedCorners(raw_corners_px, OPENCV_DETECTOR_CORNER_SIGMA_PX, False)
     return RefinedCorners(moved, SUBPIX_CORNER_SIGMA_PX, False)

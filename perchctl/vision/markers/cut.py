@@ -58,12 +58,12 @@ not sufficient evidence of the target."""
 # Distance from the image border within which an expected marker may or may not be truncated.
 _MAX_EXPECTED_CORNER_ERROR_PX = 40
 # If the cells of the small marker are smaller, the large marker is in view.
-_MIN_SMALL_MARKER_CELL_PX = 8.0
+_MIN_SMALL_MARKER_CELL_TO_FIT_PX = 8.0
 _MIN_COARSE_CORRELATION = 0.6  # Correlation required after the predicted pose has been shifted.
 _SUFFICIENT_COARSE_CORRELATION = 0.95  # Correlation above which no other range is tried.
 # Sizes of the target in the image that are tried, relative to its predicted size.
 _TARGET_IMAGE_SCALE_CANDIDATES = (1.0, 0.94, 1.06)
-_MIN_FITTED_DRAWING_CORRELATION, _MIN_TRUNCATED_CONTRAST_GREY = 0.9, 20.0
+_MIN_FITTED_DRAWING_CORRELATION, _MIN_FITTED_DRAWING_CONTRAST_GREY = 0.9, 20.0
 _MIN_FOUND_EDGE_POINT_FRACTION = 0.75  # fraction of the edge points in view that must be found
 _MAX_TRUNCATED_FIT_RMS_RESIDUAL_PX = 1.2
 _MAX_TRANSLATION_SIGMA_HALF_SIDES = 0.04
@@ -132,8 +132,8 @@ def fit_truncated_markers(
     found, otherwise of the large one.
 
     The result is empty if the target has no small marker, if the small marker's cells are narrower
-    than 8 px (`_MIN_SMALL_MARKER_CELL_PX`) in the image, if the image does not match the target, or
-    if it does not determine the target's position accurately enough.
+    than 8 px (`_MIN_SMALL_MARKER_CELL_TO_FIT_PX`) in the image, if the image does not match the
+    target, or if it does not determine the target's position accurately enough.
     """
     image, camera, patterns = (
         detector_input.image,
@@ -154,7 +154,7 @@ def fit_truncated_markers(
         / len(centre)
         * camera.K[0, 0]
         / start.t_cam_drawing_half_sides[2]
-        < _MIN_SMALL_MARKER_CELL_PX
+        < _MIN_SMALL_MARKER_CELL_TO_FIT_PX
     ):
         return {}
     covered = (
@@ -168,7 +168,7 @@ def fit_truncated_markers(
     if pose_fit is None or not _is_pose_fit_reliable(pose_fit):
         return {}
     like, gain = correlate_drawing(pose_fit.pose.H_normalised_drawing, texture, coarse_image)
-    if like < _MIN_FITTED_DRAWING_CORRELATION or gain < _MIN_TRUNCATED_CONTRAST_GREY:
+    if like < _MIN_FITTED_DRAWING_CORRELATION or gain < _MIN_FITTED_DRAWING_CONTRAST_GREY:
         return {}
     name = _select_marker_to_report(pose_fit)
     corners = _project_marker_corners(
@@ -219,7 +219,7 @@ def _select_marker_to_report(pose_fit: PoseFit) -> MarkerName:
     the large one."""
     return (
         "small"
-        if pose_fit.found_small_marker_point_count >= _MIN_EDGE_POINTS_TO_REPORT_SMALL_MARKER
+        if pose_fit.found_small_marker_edge_point_count >= _MIN_EDGE_POINTS_TO_REPORT_SMALL_MARKER
         else "large"
     )
 
@@ -266,7 +266,7 @@ def _search_near_pose(
             lattice,
             _SEARCH_HALF_WIDTH_NODES,
         )
-        mask = coarse_image.is_visible.astype(np.float32)
+        mask = coarse_image.is_node_visible.astype(np.float32)
         score = cv2.matchTemplate(wide, coarse_image.grey, cv2.TM_CCOEFF_NORMED, mask=mask)
         score = np.where(np.isfinite(score) & (np.abs(score) <= 1.001), score, -1.0)
         row, column = np.unravel_index(int(score.argmax()), score.shape)
@@ -288,10 +288,14 @@ def _is_pose_fit_reliable(pose_fit: PoseFit) -> bool:
     most uncertain direction is below `_MAX_TRANSLATION_SIGMA_HALF_SIDES`, in half sides of the
     large marker."""
     spread = math.sqrt(
-        max(float(np.linalg.eigvalsh(pose_fit.rotation_translation_cov[3:, 3:])[-1]), 0.0)
+        max(
+            float(np.linalg.eigvalsh(pose_fit.rotation_translation_cov_rad_half_sides[3:, 3:])[-1]),
+            0.0,
+        )
     )
     return (
-        pose_fit.found_point_count >= _MIN_FOUND_EDGE_POINT_FRACTION * pose_fit.visible_point_count
+        pose_fit.found_edge_point_count
+        >= _MIN_FOUND_EDGE_POINT_FRACTION * pose_fit.visible_edge_point_count
         and pose_fit.rms_residual_px < _MAX_TRUNCATED_FIT_RMS_RESIDUAL_PX
         and spread < _MAX_TRANSLATION_SIGMA_HALF_SIDES
     )
@@ -326,7 +330,10 @@ def _project_marker_corners(
         < _MAX_LENS_INVERSION_ERROR_NORMALISED
     ):
         return None
-    cov_px2 = J @ pose_fit.rotation_translation_cov @ J.T + _MIN_CORNER_SIGMA_PX**2 * np.eye(8)
+    cov_px2 = (
+        J @ pose_fit.rotation_translation_cov_rad_half_sides @ J.T
+        + _MIN_CORNER_SIGMA_PX** 2 * np.eye(8)
+    )
     sigma_px = math.sqrt(float(np.trace(cov_px2)) / 8.0)
     return RefinedCorners(corners_px, sigma_px, True, cov_px2=cov_px2)
 
@@ -352,34 +359,34 @@ class CoarseLattice:
     two points around each node, whose mean is the grey value of the node.
 
     Attributes:
-        first_node_normalised: x and y of the first node, (2,).
+        first_node_xy_normalised: x and y of the first node, (2,).
         node_spacing_normalised: distance between neighbouring nodes.
-        valid_radius_normalised: distance from the optical axis up to which the lens model is used;
-            further out, it may map two directions to the same pixel.
-        remap_x_px, remap_y_px: maps for cv2.remap (2 rows, 2 columns): x and y of each sample
-            point, px in the reduced image.
-        reduced_image_size_px: width and height of the reduced image.
-        is_in_image: True for nodes inside the image, (rows, columns).
+        valid_lens_radius_normalised: distance from the optical axis up to which the lens model is
+            used; further out, it may map two directions to the same pixel.
+        sample_x_in_reduced_image_px, sample_y_in_reduced_image_px: maps for cv2.remap (2 rows, 2
+            columns): x and y of each sample point, px in the reduced image.
+        reduced_image_width_height_px: width and height of the reduced image.
+        is_node_in_image: True for nodes inside the image, (rows, columns).
     """
 
-    first_node_normalised: Array
+    first_node_xy_normalised: Array
     node_spacing_normalised: float
-    valid_radius_normalised: float
-    remap_x_px: FloatImage
-    remap_y_px: FloatImage
-    reduced_image_size_px: tuple[int, int]
-    is_in_image: NDArray[np.bool_]
+    valid_lens_radius_normalised: float
+    sample_x_in_reduced_image_px: FloatImage
+    sample_y_in_reduced_image_px: FloatImage
+    reduced_image_width_height_px: tuple[int, int]
+    is_node_in_image: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
 class CoarseUndistortedImage:
     """A downsampled, undistorted image: grey values `grey` (rows, columns), 0 to 255, at the nodes
-    of a lattice. `is_visible` (rows, columns) is True for nodes that are inside the camera image
-    and not hidden by the vehicle."""
+    of a lattice. `is_node_visible` (rows, columns) is True for nodes that are inside the camera
+    image and not hidden by the vehicle."""
 
     lattice: CoarseLattice
     grey: FloatImage
-    is_visible: NDArray[np.bool_]
+    is_node_visible: NDArray[np.bool_]
 
 
 @lru_cache(maxsize=8)
@@ -423,13 +430,13 @@ def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
     )
     flat = x.shape
     return CoarseLattice(
-        first_node_normalised=rays.min(axis=0) + step / 2.0,
+        first_node_xy_normalised=rays.min(axis=0) + step / 2.0,
         node_spacing_normalised=step,
-        valid_radius_normalised=reach,
-        remap_x_px=np.ascontiguousarray(reduced[:, 0].reshape(flat)),
-        remap_y_px=np.ascontiguousarray(reduced[:, 1].reshape(flat)),
-        reduced_image_size_px=size,
-        is_in_image=inside.reshape(shape).all(axis=(1, 3)),
+        valid_lens_radius_normalised=reach,
+        sample_x_in_reduced_image_px=np.ascontiguousarray(reduced[:, 0].reshape(flat)),
+        sample_y_in_reduced_image_px=np.ascontiguousarray(reduced[:, 1].reshape(flat)),
+        reduced_image_width_height_px=size,
+        is_node_in_image=inside.reshape(shape).all(axis=(1, 3)),
     )
 
 
@@ -440,7 +447,7 @@ def make_coarse_image(
     across the image. Nodes at which `hidden_mask_u8` (h, w) is not zero are marked as not visible;
     without a mask, all nodes inside the image are visible."""
     lattice = make_coarse_lattice(camera)
-    seen = lattice.is_in_image
+    seen = lattice.is_node_in_image
     if hidden_mask_u8 is not None:
         covered = (hidden_mask_u8 != 0).astype(np.float32)
         seen = seen & (_sample_image_at_nodes(covered, lattice) < 1e-3)
@@ -450,10 +457,15 @@ def make_coarse_image(
 def _sample_image_at_nodes(
     image: NDArray[np.uint8] | FloatImage, lattice: CoarseLattice
 ) -> FloatImage:
-    small = cv2.resize(image, lattice.reduced_image_size_px, interpolation=cv2.INTER_AREA).astype(
-        np.float32
+    small = cv2.resize(
+        image, lattice.reduced_image_width_height_px, interpolation=cv2.INTER_AREA
+    ).astype(np.float32)
+    fine_image = cv2.remap(
+        small,
+        lattice.sample_x_in_reduced_image_px,
+        lattice.sample_y_in_reduced_image_px,
+        cv2.INTER_LINEAR,
     )
-    fine_image = cv2.remap(small, lattice.remap_x_px, lattice.remap_y_px, cv2.INTER_LINEAR)
     return _average_samples_per_node(np.asarray(fine_image, np.float32))
 
 
@@ -477,7 +489,7 @@ def render_drawing(
     drawing as an image. Beyond the texture, everything is white."""
     step = lattice.node_spacing_normalised / _SAMPLES_PER_LATTICE_NODE_AND_AXIS
     start = (
-        lattice.first_node_normalised
+        lattice.first_node_xy_normalised
         - 0.5 * (lattice.node_spacing_normalised - step)
         - margin_nodes * lattice.node_spacing_normalised
     )
@@ -486,7 +498,7 @@ def render_drawing(
     )
     white, T = texture
     M = G @ H_normalised_drawing @ np.linalg.inv(T)
-    rows, columns = lattice.is_in_image.shape
+    rows, columns = lattice.is_node_in_image.shape
     size = (
         _SAMPLES_PER_LATTICE_NODE_AND_AXIS * (columns + 2 * margin_nodes),
         _SAMPLES_PER_LATTICE_NODE_AND_AXIS * (rows + 2 * margin_nodes),
@@ -526,15 +538,15 @@ def correlate_drawing(
     image. Correlation and contrast are 0 if fewer than 200 visible nodes are on the paper
     (`_MIN_VISIBLE_NODES_ON_PAPER`)."""
     lattice = coarse_image.lattice
-    rows, columns = np.nonzero(coarse_image.is_visible)
-    at = lattice.first_node_normalised + lattice.node_spacing_normalised * np.stack(
+    rows, columns = np.nonzero(coarse_image.is_node_visible)
+    at = lattice.first_node_xy_normalised + lattice.node_spacing_normalised * np.stack(
         [columns, rows], axis=1
     ).astype(np.float64)
     on = (
         np.abs(
             apply_homography(np.asarray(np.linalg.inv(H_normalised_drawing), np.float64), at)
         ).max(axis=1)
-        < PAPER_REACH_LARGE_MARKER_HALF_SIDES
+        < PAPER_REACH_FROM_CENTRE_LARGE_HALF_SIDES
     )
     if np.count_nonzero(on) < _MIN_VISIBLE_NODES_ON_PAPER:
         return DrawingMatch(0.0, 0.0)
@@ -552,13 +564,13 @@ def correlate_drawing(
 
 
 # Distance from the target's centre up to which there is certainly paper.
-PAPER_REACH_LARGE_MARKER_HALF_SIDES = 1.25
+PAPER_REACH_FROM_CENTRE_LARGE_HALF_SIDES = 1.25
 # Points along the side of a cell of the large and of the small marker.
 _POINTS_PER_LARGE_MARKER_CELL_SIDE, _POINTS_PER_SMALL_MARKER_CELL_SIDE = 24, 6
 # Margin at both ends of a cell's side, where the corner of the next cell blurs the edge.
 _EDGE_END_MARGIN_CELLS = 0.15
 # Distance from the centre, in half sides of the small marker, within which it hides the large one.
-_SMALL_MARKER_OCCLUSION_REACH_HALF_SIDES = 1.2
+_OCCLUSION_REACH_FROM_CENTRE_SMALL_HALF_SIDES = 1.2
 _TEXTURE_SIZE_PX = 320
 
 
@@ -567,33 +579,33 @@ class TargetOutline:
     """Points along the black-white edges of the target's drawing.
 
     Attributes:
-        points_half_sides, drawing_normal_to_white: points (n, 2), in half sides of the large marker
-            from the target's centre (x right, y down on the paper), and unit normals (n, 2) from
-            black to white.
-        line_index: number (n,) of the straight line that each point is on; points with the same
-            number are collinear.
-        print_error_sigma_half_sides: standard deviation (n,) of the position of the printed line
-            that each point is on, in half sides of the large marker.
+        points_half_sides, edge_normal_to_white_in_drawing: points (n, 2), in half sides of the
+            large marker from the target's centre (x right, y down on the paper), and unit normals
+            (n, 2) from black to white.
+        line_index_per_point: number (n,) of the straight line that each point is on; points with
+            the same number are collinear.
+        printed_line_position_sigma_half_sides: standard deviation (n,) of the position of the
+            printed line that each point is on, in half sides of the large marker.
         adjacent_cell_width_half_sides: width (n,) of a cell of the marker that the point is on, in
             half sides of the large marker.
         is_on_small_marker: True for edges of the small marker, (n,).
     """
 
     points_half_sides: Array
-    drawing_normal_to_white: Array
-    line_index: NDArray[np.intp]
-    print_error_sigma_half_sides: Array
+    edge_normal_to_white_in_drawing: Array
+    line_index_per_point: NDArray[np.intp]
+    printed_line_position_sigma_half_sides: Array
     adjacent_cell_width_half_sides: Array
     is_on_small_marker: NDArray[np.bool_]
 
 
 class DrawingTexture(NamedTuple):
     """The target and its white paper as a texture: `whiteness` (m, m), 0 to 1, and the homography
-    `H_pixels_drawing` (3, 3) from the drawing's coordinates, in half sides of the large marker from
-    the target's centre, to the texture's pixels."""
+    `H_texture_px_drawing` (3, 3) from the drawing's coordinates, in half sides of the large marker
+    from the target's centre, to the texture's pixels."""
 
     whiteness: FloatImage
-    H_pixels_drawing: Array
+    H_texture_px_drawing: Array
 
 
 @lru_cache(maxsize=8)
@@ -605,7 +617,7 @@ def make_outline(
     with the small one in it. Edges of the large marker that may be hidden by the small one are
     omitted. The tolerances are standard deviations of the position of a printed edge, in cells of
     the large and of the small marker."""
-    hidden = _SMALL_MARKER_OCCLUSION_REACH_HALF_SIDES * drawing.small_to_large_side_ratio
+    hidden = _OCCLUSION_REACH_FROM_CENTRE_SMALL_HALF_SIDES * drawing.small_to_large_side_ratio
     edges = [
         edge
         for edge in _iterate_cell_edges(
@@ -627,9 +639,9 @@ def make_outline(
     small = np.repeat(np.arange(len(edges)) >= large, points_per_edge)
     return TargetOutline(
         points_half_sides=np.concatenate(at),
-        drawing_normal_to_white=np.repeat(normals, points_per_edge, axis=0),
-        line_index=np.repeat([numbers[name] for name in names], points_per_edge),
-        print_error_sigma_half_sides=np.where(
+        edge_normal_to_white_in_drawing=np.repeat(normals, points_per_edge, axis=0),
+        line_index_per_point=np.repeat([numbers[name] for name in names], points_per_edge),
+        printed_line_position_sigma_half_sides=np.where(
             small, small_print_tolerance_cells, large_print_tolerance_cells
         )
         * cell,
@@ -640,15 +652,15 @@ def make_outline(
 
 @lru_cache(maxsize=8)
 def make_drawing_texture(drawing: MarkerDrawing) -> DrawingTexture:
-    """Render the target and its white paper, out to `PAPER_REACH_LARGE_MARKER_HALF_SIDES` from the
-    centre. `drawing` is that of the large marker, with the small one in it."""
+    """Render the target and its white paper, out to `PAPER_REACH_FROM_CENTRE_LARGE_HALF_SIDES` from
+    the centre. `drawing` is that of the large marker, with the small one in it."""
     axis = make_sampling_grid(
-        _TEXTURE_SIZE_PX, PAPER_REACH_LARGE_MARKER_HALF_SIDES
+        _TEXTURE_SIZE_PX, PAPER_REACH_FROM_CENTRE_LARGE_HALF_SIDES
     ).node_positions_half_sides
-    wide = render_cells(drawing, axis, PAPER_REACH_LARGE_MARKER_HALF_SIDES / _TEXTURE_SIZE_PX)
+    wide = render_cells(drawing, axis, PAPER_REACH_FROM_CENTRE_LARGE_HALF_SIDES / _TEXTURE_SIZE_PX)
     more = (len(wide) - _TEXTURE_SIZE_PX) // 2
-    scale = _TEXTURE_SIZE_PX / (2.0 * PAPER_REACH_LARGE_MARKER_HALF_SIDES)
-    first = PAPER_REACH_LARGE_MARKER_HALF_SIDES * scale - 0.5 + more
+    scale = _TEXTURE_SIZE_PX / (2.0 * PAPER_REACH_FROM_CENTRE_LARGE_HALF_SIDES)
+    first = PAPER_REACH_FROM_CENTRE_LARGE_HALF_SIDES * scale - 0.5 + more
     T = np.array([[scale, 0.0, first], [0.0, scale, first], [0.0, 0.0, 1.0]])
     return DrawingTexture(np.clip(wide, 0.0, 1.0), T)
 
@@ -659,15 +671,16 @@ class _CellEdge(NamedTuple):
     Attributes:
         points_half_sides: points (n, 2) along the edge, in half sides of the large marker from the
             target's centre (x right, y down on the paper).
-        drawing_normal_to_white: unit normal of the edge, x and y, from black to white.
-        line_key: key of the straight line on which the edge is: ratio of the marker's side to the
-            large marker's, axis of the normal (0 = x, 1 = y), and index of the cell border.
+        edge_normal_to_white_in_drawing: unit normal of the edge, x and y, from black to white.
+        collinear_edges_key: key of the straight line on which the edge is: ratio of the marker's
+            side to the large marker's, axis of the normal (0 = x, 1 = y), and index of the cell
+            border.
         adjacent_cell_width_half_sides: width of a cell, in half sides of the large marker.
     """
 
     points_half_sides: Array
-    drawing_normal_to_white: tuple[float, float]
-    line_key: tuple[float, int, int]
+    edge_normal_to_white_in_drawing: tuple[float, float]
+    collinear_edges_key: tuple[float, int, int]
     adjacent_cell_width_half_sides: float
 
 
@@ -712,15 +725,15 @@ _PROFILE_HALF_LENGTH_PER_ITERATION_PX = (14.0, 10.0, 8.0, 8.0, 8.0, 8.0)
 _MAX_PROFILE_HALF_LENGTH_CELLS, _MIN_PROFILE_HALF_LENGTH_PX = 0.4, 3.0
 # A step below the first limit ends the fit. If the last step exceeds the second limit, the fit has
 # failed.
-_MAX_CONVERGED_STEP_PX, _MAX_LAST_STEP_PX = 0.02, 0.5
+_MAX_CONVERGED_STEP_PX, _MAX_FINAL_STEP_TO_ACCEPT_PX = 0.02, 0.5
 # Minimum contrast of an edge: in grey levels, and as a fraction of the median contrast.
 _MIN_EDGE_CONTRAST_GREY, _MIN_EDGE_TO_MEDIAN_CONTRAST_RATIO = 8.0, 0.35
-_MIN_EDGE_POINTS = 24
+_MIN_EDGE_POINTS_TO_FIT = 24
 _TUKEY_CUTOFF_SIGMAS, _MIN_TUKEY_SCALE_PX = 3.5, 0.15
 # Robust weights make the squared residuals smaller; this factor compensates for that.
 _TUKEY_VARIANCE_CORRECTION_FACTOR = 1.3
 # Error of a whole line, due to the lens and the illumination.
-_COMMON_LINE_OFFSET_SIGMA_PX = 0.02
+_COMMON_OFFSET_PER_LINE_SIGMA_PX = 0.02
 # Standard deviations of the predicted pose.
 _TILT_PRIOR_SIGMA_RAD, _ROTATION_PRIOR_SIGMA_RAD, _TRANSLATION_PRIOR_SIGMA_HALF_SIDES = (
     math.radians(2.0),
@@ -766,22 +779,22 @@ class PoseFit:
 
     Attributes:
         pose: the pose of the drawing in the camera frame.
-        rotation_translation_cov: covariance (6, 6) of small rotations of the drawing about its
-            centre (rad) and of its translation (half sides of the large marker), each along the
-            camera's x, y, z.
-        visible_point_count: number of edge points of the drawing that are in the image.
-        found_point_count: number of visible edge points at which the image has an edge that the
-            robust fit did not reject as an outlier.
-        found_small_marker_point_count: number of found points on the small marker.
+        rotation_translation_cov_rad_half_sides: covariance (6, 6) of small rotations of the drawing
+            about its centre (rad) and of its translation (half sides of the large marker), each
+            along the camera's x, y, z.
+        visible_edge_point_count: number of edge points of the drawing that are in the image.
+        found_edge_point_count: number of visible edge points at which the image has an edge that
+            the robust fit did not reject as an outlier.
+        found_small_marker_edge_point_count: number of found points on the small marker.
         rms_residual_px: RMS distance of the edges in the image from the edges of the drawing,
             weighted and corrected for the effect of the robust weights; at least 0.03.
     """
 
     pose: RigidPose
-    rotation_translation_cov: Array
-    visible_point_count: int
-    found_point_count: int
-    found_small_marker_point_count: int
+    rotation_translation_cov_rad_half_sides: Array
+    visible_edge_point_count: int
+    found_edge_point_count: int
+    found_small_marker_edge_point_count: int
     rms_residual_px: float
 
 
@@ -791,20 +804,20 @@ class _EdgePoints:
 
     Attributes:
         points_px: points (n, 2) px in the distorted image.
-        image_normal_to_white: unit normals (n, 2) of the edges in the distorted image, from black
-            to white.
-        normal_motion_jacobian: derivative (n, 7) of each point's motion along its normal, px, with
-            respect to the rotation of the drawing about its centre (rad) and its translation (half
-            sides of the large marker), each along the camera's x, y, z, and to the growth of white
-            over black at all edges (px).
+        edge_normal_to_white_in_image: unit normals (n, 2) of the edges in the distorted image, from
+            black to white.
+        normal_motion_jacobian_wrt_pose_and_shift: derivative (n, 7) of each point's motion along
+            its normal, px, with respect to the rotation of the drawing about its centre (rad) and
+            its translation (half sides of the large marker), each along the camera's x, y, z, and
+            to the growth of white over black at all edges (px).
         px_per_half_side: image scale (n,) across the edge at each point, in pixels per half side of
             the large marker.
         outline_point_index: index (n,) of each point in the arrays of the `TargetOutline`.
     """
 
     points_px: Array
-    image_normal_to_white: Array
-    normal_motion_jacobian: Array
+    edge_normal_to_white_in_image: Array
+    normal_motion_jacobian_wrt_pose_and_shift: Array
     px_per_half_side: Array
     outline_point_index: NDArray[np.intp]
 
@@ -838,9 +851,9 @@ def fit_pose(
     the projected edges of `outline` match the edges in the distorted image (h, w). Edge points with
     a profile over pixels at which `hidden_mask_u8` (h, w) is not zero are not used.
 
-    Returns None if fewer than 24 edge points (`_MIN_EDGE_POINTS`) are in view or found, if the
-    robust fit rejects too many of them, or if it does not converge. A result that is not None may
-    still be unreliable: check it with `_is_pose_fit_reliable`.
+    Returns None if fewer than 24 edge points (`_MIN_EDGE_POINTS_TO_FIT`) are in view or found, if
+    the robust fit rejects too many of them, or if it does not converge. A result that is not None
+    may still be unreliable: check it with `_is_pose_fit_reliable`.
     """
     pose, pose_and_edge_shift_change_from_start, fit_step, moved_px = (
         start,
@@ -852,7 +865,7 @@ def fit_pose(
         edge_points = _project_edge_points_in_view(
             pose, outline, max_profile_half_length_px, image.shape, camera, hidden_mask_u8
         )
-        if len(edge_points.outline_point_index) < _MIN_EDGE_POINTS:
+        if len(edge_points.outline_point_index) < _MIN_EDGE_POINTS_TO_FIT:
             return None
         reach_cells_px = (
             _MAX_PROFILE_HALF_LENGTH_CELLS
@@ -863,7 +876,7 @@ def fit_pose(
         edge_offset_to_white_px, is_edge_found = _measure_edge_offsets(
             image, edge_points, profile_half_lengths_px
         )
-        if np.count_nonzero(is_edge_found) < _MIN_EDGE_POINTS:
+        if np.count_nonzero(is_edge_found) < _MIN_EDGE_POINTS_TO_FIT:
             return None
         fit_step = _solve_gauss_newton_step(
             edge_points,
@@ -877,11 +890,13 @@ def fit_pose(
         turn = np.asarray(cv2.Rodrigues(step[:3])[0], dtype=np.float64)
         pose = RigidPose(turn @ pose.R_cam_drawing, pose.t_cam_drawing_half_sides + step[3:])
         pose_and_edge_shift_change_from_start[:6] += step
-        moved_px = float(np.abs(edge_points.normal_motion_jacobian[:, :6] @ step).max())
+        moved_px = float(
+            np.abs(edge_points.normal_motion_jacobian_wrt_pose_and_shift[:, :6] @ step).max()
+        )
         if moved_px < _MAX_CONVERGED_STEP_PX:
             break
     if fit_step is None or not (
-        moved_px <= _MAX_LAST_STEP_PX and pose.t_cam_drawing_half_sides[2] > 0.0
+        moved_px <= _MAX_FINAL_STEP_TO_ACCEPT_PX and pose.t_cam_drawing_half_sides[2] > 0.0
     ):  # also for NaN
         return None
     return _make_pose_fit(pose, fit_step, edge_points, outline)
@@ -892,7 +907,7 @@ def predict_fit_accuracy(
 ) -> PoseFit | None:
     """Return the fit that an ideal image of the drawing at `pose` in the camera frame would yield,
     in which each visible edge point has its edge exactly where it is expected. No image is needed.
-    Return None if fewer than 24 edge points (`_MIN_EDGE_POINTS`) are in view.
+    Return None if fewer than 24 edge points (`_MIN_EDGE_POINTS_TO_FIT`) are in view.
 
     In the result, only the covariance and the point counts are meaningful. The covariance is
     optimistic because an RMS residual of only 0.03 px is assumed.
@@ -901,7 +916,7 @@ def predict_fit_accuracy(
         pose, outline, _PROFILE_HALF_LENGTH_PER_ITERATION_PX[0], camera.size_px[::-1], camera, None
     )
     n = len(edge_points.outline_point_index)
-    if n < _MIN_EDGE_POINTS:
+    if n < _MIN_EDGE_POINTS_TO_FIT:
         return None
     fit_step = _solve_gauss_newton_step(
         edge_points, np.zeros(n), np.ones(n, dtype=np.bool_), np.zeros(7)
@@ -926,7 +941,7 @@ def _project_edge_points_in_view(
     ahead = X[:, 2] > 0.05
     x = X[:, :2] / np.where(ahead, X[:, 2], 1.0)[:, None]
     near = np.flatnonzero(
-        ahead & (np.hypot(*x.T) < make_coarse_lattice(camera).valid_radius_normalised)
+        ahead & (np.hypot(*x.T) < make_coarse_lattice(camera).valid_lens_radius_normalised)
     )
     at = distort_to_px(x[near], camera)
     room = max_profile_half_length_px + 1.0
@@ -948,7 +963,7 @@ def _project_edge_points_in_view(
     P[:, 0, 0] = P[:, 1, 1] = 1.0 / X[:, 2]
     P[:, :, 2] = -x / X[:, 2:]
     A = D @ P
-    across = outline.drawing_normal_to_white[near]
+    across = outline.edge_normal_to_white_in_drawing[near]
     along = np.stack([-across[:, 1], across[:, 0]], axis=1)
     tangent = np.einsum("nij,nj->ni", A, along @ pose.R_cam_drawing[:, :2].T)
     towards = np.einsum("nij,nj->ni", A, across @ pose.R_cam_drawing[:, :2].T)
@@ -984,7 +999,7 @@ def _measure_edge_offsets(
     grey = sample_profiles(
         image,
         edge_points.points_px[:, None],
-        edge_points.image_normal_to_white[:, None],
+        edge_points.edge_normal_to_white_in_image[:, None],
         profile_half_lengths_px,
     )[:, 0]
     gradient = np.diff(grey, axis=1).astype(np.float64)
@@ -1013,7 +1028,10 @@ def _solve_gauss_newton_step(
     `_measure_edge_offsets`. `pose_and_edge_shift_change_from_start` (7,) is the sum of the previous
     steps: rotation (rad), translation (half sides of the large marker) and, always 0, edge shift
     (px). The prior pulls the sum of all steps towards zero."""
-    J, weight = edge_points.normal_motion_jacobian, is_edge_found.astype(np.float64)
+    J, weight = (
+        edge_points.normal_motion_jacobian_wrt_pose_and_shift,
+        is_edge_found.astype(np.float64),
+    )
     variance, step = 1.0, np.zeros(7)
     for _ in range(4):
         error = edge_offset_to_white_px - J @ step
@@ -1023,7 +1041,7 @@ def _solve_gauss_newton_step(
             np.maximum(1.0 - (size / (_TUKEY_CUTOFF_SIGMAS * scale)) ** 2, 0.0) ** 2 * is_edge_found
         )
         mass = float(weight.sum())
-        if mass < 0.5 * _MIN_EDGE_POINTS:
+        if mass < 0.5 * _MIN_EDGE_POINTS_TO_FIT:
             return None
         variance = max(_TUKEY_VARIANCE_CORRECTION_FACTOR * float(weight @ error**2) / mass, 1e-3)
         N = (J * weight[:, None]).T @ J / variance + np.diag(_POSE_PRIOR_INFORMATION_DIAGONAL)
@@ -1038,12 +1056,12 @@ def _solve_gauss_newton_step(
 def _make_pose_fit(
     pose: RigidPose, fit_step: _GaussNewtonStep, edge_points: _EdgePoints, outline: TargetOutline
 ) -> PoseFit:
-    J, (_, inverse, w, variance) = edge_points.normal_motion_jacobian, fit_step
-    line = outline.line_index[edge_points.outline_point_index]
+    J, (_, inverse, w, variance) = edge_points.normal_motion_jacobian_wrt_pose_and_shift, fit_step
+    line = outline.line_index_per_point[edge_points.outline_point_index]
     common_px = np.hypot(
-        outline.print_error_sigma_half_sides[edge_points.outline_point_index]
+        outline.printed_line_position_sigma_half_sides[edge_points.outline_point_index]
         * edge_points.px_per_half_side,
-        _COMMON_LINE_OFFSET_SIGMA_PX,
+        _COMMON_OFFSET_PER_LINE_SIGMA_PX,
     )
     by_line = np.zeros((int(line.max()) + 1, J.shape[1]))
     np.add.at(by_line, line, J * (w * common_px)[:, None])
@@ -1052,10 +1070,10 @@ def _make_pose_fit(
     shown = w > 0.0
     return PoseFit(
         pose=pose,
-        rotation_translation_cov=cov[:6, :6],
-        visible_point_count=len(shown),
-        found_point_count=int(np.count_nonzero(shown)),
-        found_small_marker_point_count=int(
+        rotation_translation_cov_rad_half_sides=cov[:6, :6],
+        visible_edge_point_count=len(shown),
+        found_edge_point_count=int(np.count_nonzero(shown)),
+        found_small_marker_edge_point_count=int(
             np.count_nonzero(shown & outline.is_on_small_marker[edge_points.outline_point_index])
         ),
         rms_residual_px=math.sqrt(variance),

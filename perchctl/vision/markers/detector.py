@@ -29,7 +29,7 @@ from perchctl.vision.types import CameraModel, Frame, MarkerName
 MIRRORED_MARKER_ID = 1
 """Index of the marker's mirror image in its dictionary."""
 # The error of an edge is small because the errors of its hundreds of printed dots average out.
-_PRINT_EDGE_SIGMA_M = 1e-6
+_PRINTED_EDGE_POSITION_SIGMA_M = 1e-6
 _MIN_MARKER_PERIMETER_PX = 19.2  # OpenCV's default, 0.03 times the image size, for 640 px
 _QUAD_DETECTOR_MIN_PERIMETER_RATE = 0.05
 _QUAD_DETECTOR_POLYGON_ACCURACY_RATE = 0.1
@@ -84,7 +84,8 @@ def make_detector_setup(
         patterns={
             "large": make_marker_pattern(
                 make_cells_along_border(
-                    large_bits, _PRINT_EDGE_SIGMA_M * (len(large_bits) + 2) / target.large.side_m
+                    large_bits,
+                    _PRINTED_EDGE_POSITION_SIGMA_M * (len(large_bits) + 2) / target.large.side_m,
                 ),
                 make_marker_drawing(
                     large_bits,
@@ -95,7 +96,8 @@ def make_detector_setup(
             ),
             "small": make_marker_pattern(
                 make_cells_along_border(
-                    small_bits, _PRINT_EDGE_SIGMA_M * (len(small_bits) + 2) / target.small.side_m
+                    small_bits,
+                    _PRINTED_EDGE_POSITION_SIGMA_M * (len(small_bits) + 2) / target.small.side_m,
                 ),
                 make_marker_drawing(small_bits),
             ),
@@ -153,12 +155,12 @@ def _make_aruco_dictionary(bits: NDArray[np.uint8], max_correction_bits: int) ->
 
 
 HiddenMask = NDArray[np.bool_]
-WHITE_BORDER_REACH_HALF_SIDES = 1.25
+WHITE_BORDER_REACH_FROM_CENTRE_HALF_SIDES = 1.25
 """Distance from a marker's centre, in half sides, within which any object disturbs the measurement
 of the marker's sides."""
 _HIDDEN_MASK_DILATION_ROWS = 7  # A covered row contributes to this number of a field's image rows.
 # Factor by which the image is reduced, and standard deviation of the fill in the reduced image.
-_FILL_REDUCTION_FACTOR, _FILL_SIGMA_REDUCED_PX = 8, 2.0
+_FILL_IMAGE_REDUCTION_FACTOR, _FILL_BLUR_SIGMA_REDUCED_IMAGE_PX = 8, 2.0
 _MEAN_GREY_WEIGHT_IN_FILL = 1e-4
 
 
@@ -182,11 +184,13 @@ def fill_hidden_pixels(image: NDArray[np.uint8], hidden_mask: HiddenMask) -> NDA
     smooth interpolation of their surroundings."""
     h, w = image.shape
     free = (~hidden_mask).astype(np.float32)
-    size = (max(w // _FILL_REDUCTION_FACTOR, 1), max(h // _FILL_REDUCTION_FACTOR, 1))
+    size = (max(w // _FILL_IMAGE_REDUCTION_FACTOR, 1), max(h // _FILL_IMAGE_REDUCTION_FACTOR, 1))
 
     def around(values: NDArray[np.float32]) -> NDArray[np.float32]:
         reduced = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
-        return np.asarray(cv2.GaussianBlur(reduced, (0, 0), _FILL_SIGMA_REDUCED_PX), np.float32)
+        return np.asarray(
+            cv2.GaussianBlur(reduced, (0, 0), _FILL_BLUR_SIGMA_REDUCED_IMAGE_PX), np.float32
+        )
 
     mean = cv2.mean(image, (~hidden_mask).astype(np.uint8))[0]
     grey = (around(image * free) + _MEAN_GREY_WEIGHT_IN_FILL * mean) / (
@@ -199,17 +203,17 @@ def fill_hidden_pixels(image: NDArray[np.uint8], hidden_mask: HiddenMask) -> NDA
 def is_any_marker_part_hidden(
     hidden_mask: HiddenMask | None,
     corners_px: Array,
-    reach_half_sides: float = WHITE_BORDER_REACH_HALF_SIDES,
+    reach_from_centre_half_sides: float = WHITE_BORDER_REACH_FROM_CENTRE_HALF_SIDES,
 ) -> bool:
     """True if the vehicle hides any pixel of the marker with `corners_px` (4, 2) in the image or of
-    its surroundings: of a concentric square whose half side is `reach_half_sides` times the
-    marker's. `hidden_mask` (h, w) is True for hidden pixels. The result is False if there is no
+    its surroundings: of a concentric square whose half side is `reach_from_centre_half_sides` times
+    the marker's. `hidden_mask` (h, w) is True for hidden pixels. The result is False if there is no
     mask or if a corner is not finite."""
     if hidden_mask is None:
         return False
     h, w = hidden_mask.shape
     centre = corners_px.mean(axis=0)
-    wide = centre + reach_half_sides * (corners_px - centre)
+    wide = centre + reach_from_centre_half_sides * (corners_px - centre)
     if not np.isfinite(wide).all():
         return False
     low = np.clip(np.floor(wide.min(axis=0)), 0, (w - 1, h - 1)).astype(int)

@@ -194,7 +194,7 @@ _MIN_INLIER_FRACTION = 0.5
 # Robust weights reduce the squared residuals and the number of samples; this factor compensates.
 _TUKEY_LINE_VARIANCE_CORRECTION_FACTOR = 1.7
 # Size and range, in units of the blur, of the error that a neighbouring edge one cell away causes.
-_NEIGHBOUR_ERROR_TO_BLUR_RATIO, _NEIGHBOUR_ERROR_RANGE_BLURS = 0.6, 2.0
+_NEIGHBOUR_EDGE_ERROR_TO_BLUR_RATIO, _NEIGHBOUR_EDGE_ERROR_DECAY_BLUR_SIGMAS = 0.6, 2.0
 # Profiles are too short for wide edges. The error, px, grows with the cube of the blur.
 _EDGE_ERROR_PER_CUBED_BLUR_PER_PX2 = 0.0022
 # If white is clipped, edges move by different amounts.
@@ -202,18 +202,18 @@ CORNER_SIGMA_IF_WHITE_CLIPPED_PX = 0.1
 # White counts as clipped if more than this fraction of the profiles (or pixels) is clipped.
 MIN_CLIPPED_WHITE_FRACTION = 0.05
 # A wide edge that is off centre extends beyond its profile.
-_MIN_WIDE_EDGE_BLUR_PX, _MAX_WIDE_EDGE_OFFSET_WITHOUT_REFIT_PX = 2.2, 0.5
+_MIN_WIDE_EDGE_BLUR_SIGMA_PX, _MAX_WIDE_EDGE_OFFSET_WITHOUT_REFIT_PX = 2.2, 0.5
 # Profiles reach at most 7 px to each side. An edge 6 px off the centre extended beyond its profile
 # and moved by up to 0.3 px.
 _MAX_EDGE_OFFSET_WITHOUT_REFIT_PX = 4.0
 # A larger ratio of the two variances shows that the image rows jitter.
 _MIN_VERTICAL_TO_HORIZONTAL_SIDE_VARIANCE_RATIO = 2.0
 # Vertical and horizontal sides can only be separated if their orientations (0 to 1) vary enough.
-_MIN_ORIENTATION_VARIANCE_FOR_ROW_JITTER = 0.05
+_MIN_SIDE_ORIENTATION_VARIANCE_FOR_ROW_JITTER = 0.05
 _MIN_MEAN_EDGE_CONTRAST_GREY = 6.0  # contrast between the dark and the bright side of an edge
 _MIN_EDGE_SHIFT_SIGMA_PX = 0.01
 _MAX_EDGE_SHIFT_PX = 1.0
-_MAX_EDGE_BLUR_CELLS = 0.45  # with more blur, the two edges of a border merge
+_MAX_EDGE_BLUR_SIGMA_CELLS = 0.45  # with more blur, the two edges of a border merge
 _MIN_PROFILE_WEIGHT_SUM_PER_SIDE = 3.0
 _EDGE_SHIFT_PRIOR_SIGMA_PX = 0.15  # The shift is due to glare and gamma.
 _EDGE_SHIFT_PRIOR_SIGMA_IF_CLIPPED_PX = 0.4  # The shift is due to clipping.
@@ -260,7 +260,7 @@ def refine_corners_by_lines(
         off_px = float(np.abs(each.corners_px - raw_corners_px[i]).max())
         if off_px > (
             _MAX_WIDE_EDGE_OFFSET_WITHOUT_REFIT_PX
-            if each.blurriest_side_blur_sigma_px > _MIN_WIDE_EDGE_BLUR_PX
+            if each.blurriest_side_blur_sigma_px > _MIN_WIDE_EDGE_BLUR_SIGMA_PX
             else _MAX_EDGE_OFFSET_WITHOUT_REFIT_PX
         ):
             centred[i] = each.corners_px
@@ -311,7 +311,7 @@ def _refine_corners_by_lines_once(
     if applied.white_growth_per_edge_px != 0.0:
         line_nx_ny_c = line_nx_ny_c.copy()
         line_nx_ny_c[:, 2] += _line_normal_outward_signs(markers, line_nx_ny_c) * (
-            applied.white_growth_per_edge_px / markers.px_per_normalised_unit
+            applied.white_growth_per_edge_px / markers.px_per_normalised_unit_per_side
         )
     corners = _intersect_adjacent_sides(line_nx_ny_c)
     if not is_finite(corners):
@@ -321,7 +321,10 @@ def _refine_corners_by_lines_once(
     # The standard deviation of a line fitted to n samples is twice as large at its ends as in its
     # middle.
     independent = np.maximum(
-        np.minimum(outer_edges.weight.dot(_PROFILE_ONES), markers.side_lengths_px.ravel()), 4.0
+        np.minimum(
+            outer_edges.edge_point_weight.dot(_PROFILE_ONES), markers.side_lengths_px.ravel()
+        ),
+        4.0,
     )
     line_end_variances_px2 = (
         4.0
@@ -336,7 +339,7 @@ def _refine_corners_by_lines_once(
             continue
         four = slice(4 * i, 4 * i + 4)
         ends, blurs = line_end_variances_px2[four], blurs_px[four]
-        cell_size_px, blur_px = float(markers.cell_size_px[i]), sum(blurs) / 4.0
+        cell_size_px, blur_px = float(markers.mean_cell_size_per_marker_px[i]), sum(blurs) / 4.0
         found[i] = RefinedCorners(
             corners_px=corners_px[i],
             sigma_px=_corner_sigma_px(
@@ -361,8 +364,11 @@ def _fit_lines(markers: MarkerSides, outer_edges: MeasuredEdges) -> tuple[Array,
     Return the coefficients (nx, ny, c) of each line, (4m, 3), with n.x = c and |n| = 1 in
     normalised image coordinates, and the weighted RMS distance of the points from each line, px
     (4m,)."""
-    w = outer_edges.weight / np.maximum(outer_edges.weight.dot(_PROFILE_ONES), 1e-9)[:, None]
-    x, y = outer_edges.points_normalised[..., 0], outer_edges.points_normalised[..., 1]
+    w = (
+        outer_edges.edge_point_weight
+        / np.maximum(outer_edges.edge_point_weight.dot(_PROFILE_ONES), 1e-9)[:, None]
+    )
+    x, y = outer_edges.edge_points_normalised[..., 0], outer_edges.edge_points_normalised[..., 1]
     cx, cy = (w * x).dot(_PROFILE_ONES), (w * y).dot(_PROFILE_ONES)
     dx, dy = x - cx[:, None], y - cy[:, None]
     wx = w * dx
@@ -380,7 +386,9 @@ def _fit_lines(markers: MarkerSides, outer_edges: MeasuredEdges) -> tuple[Array,
         ny,
         nx * cx + ny * cy,
     )
-    return line_nx_ny_c, np.sqrt(np.maximum(residual2, 0.0)) * markers.px_per_normalised_unit
+    return line_nx_ny_c, np.sqrt(
+        np.maximum(residual2, 0.0)
+    ) * markers.px_per_normalised_unit_per_side
 
 
 def _intersect_adjacent_sides(line_nx_ny_c: Array) -> Array:
@@ -434,21 +442,24 @@ def _measure_edge_shift(
     if inner_edges is None:
         return None
     k, prior_px = (
-        markers.widest_cells_marker_index,
+        markers.index_of_marker_with_widest_cells,
         edge_shift_prior_sigma_px(float(outer_edges.profile_greys[:, :, -1].mean())),
     )
     rim, depth_px, cell_size_px = (
         markers.cells_along_border[k],
         markers.cell_width_across_side_px[k],
-        float(markers.cell_size_px[k]),
+        float(markers.mean_cell_size_per_marker_px[k]),
     )
     r = 1.0 - 2.0 / rim.cells_per_side
     own = apply_homography(
-        homography_to_centred_square(corners_normalised[k]), inner_edges.points_normalised
+        homography_to_centred_square(corners_normalised[k]), inner_edges.edge_points_normalised
     )
     far = np.matmul(own, SIDE_OUTWARD_NORMALS[:, :, None])[..., 0] - r
     far_px = far * (depth_px / (1.0 - r * r))[:, None]
-    w = inner_edges.weight * (inner_edges.blur_sigma_px < _MAX_EDGE_BLUR_CELLS * depth_px)[:, None]
+    w = (
+        inner_edges.edge_point_weight
+        * (inner_edges.blur_sigma_px < _MAX_EDGE_BLUR_SIGMA_CELLS * depth_px)[:, None]
+    )
     w *= np.abs(far_px) < _MAX_EDGE_SHIFT_PX
     mass = w.sum(axis=1)
     some = mass > _MIN_PROFILE_WEIGHT_SUM_PER_SIDE
@@ -460,7 +471,7 @@ def _measure_edge_shift(
         8.0
         * r
         / (3.0 * rim.cells_per_side)
-        * _side_ends_outward_bow_px(markers, outer_edges, line_nx_ny_c, rms_residual_px)
+        * _measure_outward_bow_of_side_ends_px(markers, outer_edges, line_nx_ny_c, rms_residual_px)
     )
     far_px = far_px + bent_px
     share = w / np.maximum(mass, 1e-9)[:, None]
@@ -484,7 +495,7 @@ def _measure_edge_shift(
     )
 
 
-def _side_ends_outward_bow_px(
+def _measure_outward_bow_of_side_ends_px(
     markers: MarkerSides, outer_edges: MeasuredEdges, line_nx_ny_c: Array, rms_residual_px: Array
 ) -> float:
     """Return by how many pixels the ends of the sides of the marker with the widest cells are
@@ -492,17 +503,22 @@ def _side_ends_outward_bow_px(
     parabola is fitted to the distances of each side's edge points from its line, and the result is
     the mean over the four sides; 0 if it is not significant compared with the noise. `line_nx_ny_c`
     (4m, 3) and `rms_residual_px` (4m,) are the results of `_fit_lines`."""
-    four = slice(4 * markers.widest_cells_marker_index, 4 * markers.widest_cells_marker_index + 4)
+    four = slice(
+        4 * markers.index_of_marker_with_widest_cells,
+        4 * markers.index_of_marker_with_widest_cells + 4,
+    )
     away = (
-        np.matmul(outer_edges.points_normalised[four], line_nx_ny_c[four, :2, None])[..., 0]
+        np.matmul(outer_edges.edge_points_normalised[four], line_nx_ny_c[four, :2, None])[..., 0]
         - line_nx_ny_c[four, 2:]
     )
     scale = (
         _line_normal_outward_signs(markers, line_nx_ny_c)[four]
-        * markers.px_per_normalised_unit[four]
+        * markers.px_per_normalised_unit_per_side[four]
     )
-    mass = np.maximum(outer_edges.weight[four] @ (_ZERO_MEAN_PARABOLA * _ZERO_MEAN_PARABOLA), 1e-9)
-    bow_px = scale * ((outer_edges.weight[four] * away) @ _ZERO_MEAN_PARABOLA) / mass
+    mass = np.maximum(
+        outer_edges.edge_point_weight[four] @ (_ZERO_MEAN_PARABOLA * _ZERO_MEAN_PARABOLA), 1e-9
+    )
+    bow_px = scale * ((outer_edges.edge_point_weight[four] * away) @ _ZERO_MEAN_PARABOLA) / mass
     mean_px = float(bow_px @ _MEAN_OF_FOUR_WEIGHTS)
     noise_px = 0.25 * math.sqrt(float((rms_residual_px[four] ** 2 / mass).sum()))
     return mean_px if abs(mean_px) > _MIN_SIGNIFICANT_BOW_SIGMAS * noise_px else 0.0
@@ -520,7 +536,7 @@ def _line_normal_outward_signs(markers: MarkerSides, line_nx_ny_c: Array) -> Arr
 def _are_markers_accepted(
     markers: MarkerSides, outer_edges: MeasuredEdges, rms_residual_px: Array, corners_px: Array
 ) -> NDArray[np.bool_]:
-    inliers = np.count_nonzero(outer_edges.weight > 0.0, axis=1)
+    inliers = np.count_nonzero(outer_edges.edge_point_weight > 0.0, axis=1)
     # Contrast between two samples near the ends of each profile: dark inside, white outside.
     contrast = np.abs(outer_edges.profile_greys[:, :, -3] - outer_edges.profile_greys[:, :, 2]).dot(
         _PROFILE_ONES_F32
@@ -533,8 +549,10 @@ def _are_markers_accepted(
     )
     displacement = corners_px - markers.raw_corners_px
     moved_px = np.hypot(displacement[..., 0], displacement[..., 1]).max(axis=1)
-    good = lines.reshape(-1, 4).all(axis=1) & (markers.cell_size_px > _MIN_CELL_PX)
-    return np.asarray(good & (moved_px < np.maximum(1.6, 0.6 * markers.cell_size_px)))
+    good = lines.reshape(-1, 4).all(axis=1) & (markers.mean_cell_size_per_marker_px > _MIN_CELL_PX)
+    return np.asarray(
+        good & (moved_px < np.maximum(1.6, 0.6 * markers.mean_cell_size_per_marker_px))
+    )
 
 
 def _corner_sigma_px(
@@ -548,9 +566,9 @@ def _corner_sigma_px(
     # If cells are only a few pixels wide, the blur of the inner pattern reaches the border's outer
     # edge.
     bend_px = (
-        _NEIGHBOUR_ERROR_TO_BLUR_RATIO
+        _NEIGHBOUR_EDGE_ERROR_TO_BLUR_RATIO
         * blur_sigma_px
-        * math.exp(-cell_size_px / (_NEIGHBOUR_ERROR_RANGE_BLURS * blur_sigma_px))
+        * math.exp(-cell_size_px / (_NEIGHBOUR_EDGE_ERROR_DECAY_BLUR_SIGMAS * blur_sigma_px))
     )
     reach_px = _EDGE_ERROR_PER_CUBED_BLUR_PER_PX2 * blur_sigma_px**3
     clipped_px = CORNER_SIGMA_IF_WHITE_CLIPPED_PX if is_white_clipped else 0.0
@@ -575,7 +593,7 @@ def _row_jitter_sigma_px(
     upright = [x * x for x in side_normals_x]
     mean = sum(upright) / 4.0
     aspect = sum((each - mean) ** 2 for each in upright) / 4.0
-    if aspect <= _MIN_ORIENTATION_VARIANCE_FOR_ROW_JITTER:
+    if aspect <= _MIN_SIDE_ORIENTATION_VARIANCE_FOR_ROW_JITTER:
         return 0.0
     both = zip(line_end_variances_px2, upright, strict=True)
     slope = sum(end * (each - mean) for end, each in both) / 4.0 / aspect
@@ -609,10 +627,13 @@ class MarkerSides:
         side_lengths_px: length of each side (m, 4).
         cell_width_across_side_px: width (m, 4) of the border, which is one cell wide, perpendicular
             to each side.
-        cell_size_px: mean side length divided by the number of cells per side, (m,).
-        widest_cells_marker_index: index of the marker with the widest cells.
-        clockwise_sign: +1 if the corners are in clockwise order, -1 if counterclockwise, (m,).
-        px_per_normalised_unit: pixels per unit of normalised coordinates along each side, (4m,).
+        mean_cell_size_per_marker_px: mean side length divided by the number of cells per side,
+            (m,).
+        index_of_marker_with_widest_cells: index of the marker with the widest cells.
+        clockwise_sign_per_marker: +1 if the corners are in clockwise order, -1 if counterclockwise,
+            (m,).
+        px_per_normalised_unit_per_side: pixels per unit of normalised coordinates along each side,
+            (4m,).
     """
 
     raw_corners_px: Array
@@ -620,10 +641,10 @@ class MarkerSides:
     corners_normalised: Array
     side_lengths_px: Array
     cell_width_across_side_px: Array
-    cell_size_px: Array
-    widest_cells_marker_index: int
-    clockwise_sign: Array
-    px_per_normalised_unit: Array
+    mean_cell_size_per_marker_px: Array
+    index_of_marker_with_widest_cells: int
+    clockwise_sign_per_marker: Array
+    px_per_normalised_unit_per_side: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -635,16 +656,17 @@ class MeasuredEdges:
         profile_greys: grey values at 17 points along each profile, from its dark end to its bright
             end, (rows, n, 17).
         window_half_length_px: half length of the window in which the edge is located, (rows,).
-        points_normalised: position of the edge on each profile, in normalised image coordinates,
-            (rows, n, 2).
-        weight: robust weight of each edge point in the line fit, 0 to 1; 0 for outliers, (rows, n).
+        edge_points_normalised: position of the edge on each profile, in normalised image
+            coordinates, (rows, n, 2).
+        edge_point_weight: robust weight of each edge point in the line fit, 0 to 1; 0 for outliers,
+            (rows, n).
         blur_sigma_px: standard deviation of the Gaussian blur of each side's edge, (rows,).
     """
 
     profile_greys: Floats
     window_half_length_px: Array
-    points_normalised: Array
-    weight: Array
+    edge_points_normalised: Array
+    edge_point_weight: Array
     blur_sigma_px: Array
 
 
@@ -674,10 +696,10 @@ def prepare_marker_sides(
         side_lengths_px=sides_px,
         # The inner edge is one cell further in, measured along the neighbouring sides.
         cell_width_across_side_px=0.5 * across_px / cells[:, None],
-        cell_size_px=cell_size_px,
-        widest_cells_marker_index=int(cell_size_px.argmax()),
-        clockwise_sign=turn,
-        px_per_normalised_unit=(sides_px / np.hypot(along[..., 0], along[..., 1])).ravel(),
+        mean_cell_size_per_marker_px=cell_size_px,
+        index_of_marker_with_widest_cells=int(cell_size_px.argmax()),
+        clockwise_sign_per_marker=turn,
+        px_per_normalised_unit_per_side=(sides_px / np.hypot(along[..., 0], along[..., 1])).ravel(),
     )
 
 
@@ -689,20 +711,20 @@ def measure_edges(
 ) -> tuple[MeasuredEdges, MeasuredEdges | None]:
     """Measure two sets of edges in the image: the outer edges of the black borders of all markers,
     with 4m rows, of which rows 4 i to 4 i + 3 belong to marker i; and the four inner edges of the
-    border of the marker with the widest cells (`widest_cells_marker_index`). The inner edges are
-    None if `must_measure_inner_edges` is False or if that marker's cells are not wider than
-    `_MIN_CELL_TO_MEASURE_EDGE_SHIFT_PX`."""
+    border of the marker with the widest cells (`index_of_marker_with_widest_cells`). The inner
+    edges are None if `must_measure_inner_edges` is False or if that marker's cells are not wider
+    than `_MIN_CELL_TO_MEASURE_EDGE_SHIFT_PX`."""
     starts, lengths_px, depth_px = (
         markers.corners_normalised,
         markers.side_lengths_px,
         markers.cell_width_across_side_px,
     )
     of = np.arange(len(starts)).repeat(4)
-    widest = markers.widest_cells_marker_index
+    widest = markers.index_of_marker_with_widest_cells
     rim = markers.cells_along_border[widest]
     must_measure_inner_edges = (
         must_measure_inner_edges
-        and float(markers.cell_size_px[widest]) > _MIN_CELL_TO_MEASURE_EDGE_SHIFT_PX
+        and float(markers.mean_cell_size_per_marker_px[widest]) > _MIN_CELL_TO_MEASURE_EDGE_SHIFT_PX
     )
     if must_measure_inner_edges:
         r = 1.0 - 2.0 / rim.cells_per_side
@@ -715,7 +737,7 @@ def measure_edges(
         of = np.append(of, (widest, widest, widest, widest))
     # The normals point out of a marker with clockwise corners. A profile must start on its dark
     # side.
-    sign = markers.clockwise_sign[of]
+    sign = markers.clockwise_sign_per_marker[of]
     if must_measure_inner_edges:
         sign[-4:] *= -1.0
     s = profile_fractions_along_side(lengths_px.ravel())
@@ -723,7 +745,8 @@ def measure_edges(
     origin, normal = make_profile_centres_and_normals(starts.reshape(-1, 2), ends, s, camera)
     normal *= sign[:, None, None]
     window_half_length_px, profile_half_length_px = (
-        each[of] for each in window_and_profile_half_lengths_px(markers.cell_size_px)
+        each[of]
+        for each in window_and_profile_half_lengths_px(markers.mean_cell_size_per_marker_px)
     )
     profile_greys = sample_profiles(image, origin, normal, profile_half_length_px)
     around = find_neighbour_edges(s, markers.cells_along_border, rim, depth_px.ravel())
@@ -771,14 +794,14 @@ def find_neighbour_edges(
     The rows are the four outer edges of each marker in `cells_along_border`, then, if there are
     four more, the inner edges of the border of the marker with `cells_along_inner_edges`.
     """
-    inner_neighbour_count, outer_neighbour_count = (
+    has_inner_neighbour_f32, has_outer_neighbour_f32 = (
         np.zeros(fractions_along_side.shape, np.float32),
         np.zeros(fractions_along_side.shape, np.float32),
     )
-    is_edge_locatable = np.ones(fractions_along_side.shape, np.bool_)
+    is_edge_locatable_per_profile = np.ones(fractions_along_side.shape, np.bool_)
     for i, rim in enumerate(cells_along_border):
         four = slice(4 * i, 4 * i + 4)
-        inner_neighbour_count[four] = rim.is_first_inner_cell_white[
+        has_inner_neighbour_f32[four] = rim.is_first_inner_cell_white[
             _SIDE_INDICES, (fractions_along_side[four] * rim.cells_per_side).astype(np.intp)
         ]
     if len(fractions_along_side) > 4 * len(cells_along_border):
@@ -794,10 +817,13 @@ def find_neighbour_edges(
                 _SIDE_INDICES, (at + 0.3).astype(np.intp)
             ]
         )
-        is_edge_locatable[-4:] = free > 0.0
-        outer_neighbour_count[-4:] = 1.0
+        is_edge_locatable_per_profile[-4:] = free > 0.0
+        has_outer_neighbour_f32[-4:] = 1.0
     return NeighbourEdges(
-        neighbour_distance_px, inner_neighbour_count, outer_neighbour_count, is_edge_locatable
+        neighbour_distance_px,
+        has_inner_neighbour_f32,
+        has_outer_neighbour_f32,
+        is_edge_locatable_per_profile,
     )
 
 
@@ -851,16 +877,17 @@ class NeighbourEdges:
     Attributes:
         neighbour_distance_px: distance of a neighbouring edge from the measured edge: the width of
             a cell across the edge, (rows,).
-        inner_neighbour_count, outer_neighbour_count: 1.0 for each profile that has a neighbouring
-            edge, of opposite contrast, one cell further in or one cell further out, and 0.0 for
-            each other profile, (rows, n).
-        is_edge_locatable: False for profiles on which the edge can't be located, (rows, n).
+        has_inner_neighbour_f32, has_outer_neighbour_f32: 1.0 for each profile that has a
+            neighbouring edge, of opposite contrast, one cell further in or one cell further out,
+            and 0.0 for each other profile, (rows, n).
+        is_edge_locatable_per_profile: False for profiles on which the edge can't be located, (rows,
+            n).
     """
 
     neighbour_distance_px: Array
-    inner_neighbour_count: Floats
-    outer_neighbour_count: Floats
-    is_edge_locatable: NDArray[np.bool_]
+    has_inner_neighbour_f32: Floats
+    has_outer_neighbour_f32: Floats
+    is_edge_locatable_per_profile: NDArray[np.bool_]
 
 
 def locate_edges(
@@ -932,11 +959,11 @@ class _EdgeProfiles:
             0.25 * self.window_half_length_px * self.window_half_length_px
         )  # Maximum variance of a window.
         # Number of neighbouring edges on both sides, and the difference outside minus inside.
-        self.neighbour_count, self.outer_minus_inner_neighbour_count = (
-            neighbours.inner_neighbour_count + neighbours.outer_neighbour_count,
-            neighbours.outer_neighbour_count - neighbours.inner_neighbour_count,
+        self.neighbour_count, self.outer_minus_inner_neighbour_f32 = (
+            neighbours.has_inner_neighbour_f32 + neighbours.has_outer_neighbour_f32,
+            neighbours.has_outer_neighbour_f32 - neighbours.has_inner_neighbour_f32,
         )
-        self.edge_locatable_f32 = neighbours.is_edge_locatable.astype(np.float32)
+        self.edge_locatable_f32 = neighbours.is_edge_locatable_per_profile.astype(np.float32)
         # The sum over a row's profiles times this factor is the minimum gradient of a usable one.
         self.min_gradient_to_row_sum_ratio = _MIN_PROFILE_TO_MEAN_GRADIENT_RATIO / np.maximum(
             self.edge_locatable_f32.dot(_PROFILE_ONES_F32), 1.0
@@ -1000,7 +1027,7 @@ class _EdgeProfiles:
         relative *= mass
         first = (
             relative @ _SAMPLE_ONES
-            + total * self.outer_minus_inner_neighbour_count * (lost * place)[:, None]
+            + total * self.outer_minus_inner_neighbour_f32 * (lost * place)[:, None]
         )
         mass *= squared
         second = (

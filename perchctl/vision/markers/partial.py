@@ -481,7 +481,7 @@ def find_visible_edges(
     around = find_neighbour_edges(
         s, [pattern.cells_along_border], pattern.cells_along_border, depth_px
     )
-    is_unobstructed = around.is_edge_locatable & _is_profile_in_view(
+    is_unobstructed = around.is_edge_locatable_per_profile & _is_profile_in_view(
         detector_input, origin, normal, window_half_length_px
     )
     kept = np.flatnonzero(
@@ -503,7 +503,10 @@ def find_visible_edges(
         return None
     good, white = lit
     around = NeighbourEdges(
-        depth_px[kept], around.inner_neighbour_count[kept], around.outer_neighbour_count[kept], good
+        depth_px[kept],
+        around.has_inner_neighbour_f32[kept],
+        around.has_outer_neighbour_f32[kept],
+        good,
     )
     offset_px, weight, blur_px = locate_edges(
         profile_greys, profile_half_length_px, window_half_length_px, around

@@ -166,7 +166,7 @@ def test_what_leaves_a_direction_open_is_refused() -> None:
     outline = make_outline(SETUP.patterns["large"].drawing, 0.0, 0.0)
     image = render(*LINE, plain, noise=4.0, blur_px=1.0)
     found = fit_pose(image, _pose("line"), outline, plain)
-    assert found.found_point_count == found.visible_point_count
+    assert found.found_edge_point_count == found.visible_edge_point_count
     expected: dict[MarkerName, Array] = {"small": project(square_corners(0.025), *LINE, plain)}
     assert fit_truncated_markers(DetectorInput(image, None, SETUP, plain), expected) == {}
     assert nothing(search_mode("width", waved(picture("width")))), "nor do edges that fit badly"
@@ -198,7 +198,7 @@ def test_what_the_gear_covers_counts_neither_way() -> None:
     outline = make_outline(SETUP.patterns["large"].drawing, 0.0, 0.0)
     own = mask.astype(np.uint8)
     fit = fit_pose(image, _pose("height"), outline, CAMERA, own)
-    assert fit.found_point_count == fit.visible_point_count
+    assert fit.found_edge_point_count == fit.visible_edge_point_count
     found = fit_truncated_markers(DetectorInput(image, mask, SETUP, CAMERA), expected)["small"]
     error = (undistort_px(found.corners_px, CAMERA) - undistort_px(true, CAMERA)).ravel()
     assert float(error @ np.linalg.solve(found.cov_px2, error)) < 20.0
@@ -231,7 +231,7 @@ def test_corners_that_the_lens_cannot_image_are_not_given() -> None:
     x = undistort_to_normalised(distort_to_px(np.array([[2.3, 0.6]]), CAMERA), CAMERA)
     assert np.abs(x - (2.3, 0.6)).max() > 1e-2
     found = fit_pose(image, _pose("corner"), outline, CAMERA)
-    assert found.found_small_marker_point_count == 0
+    assert found.found_small_marker_edge_point_count == 0
     assert (
         fit_truncated_markers(DetectorInput(image, None, SETUP, CAMERA), both(POSES["corner"]))
         == {}

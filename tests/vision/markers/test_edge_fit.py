@@ -11,7 +11,7 @@ import pytest
 from perchctl.geometry import Array
 from perchctl.vision import project, square_corners
 from perchctl.vision.markers.corners import (
-    DETECTOR_CORNER_SIGMA_PX,
+    OPENCV_DETECTOR_CORNER_SIGMA_PX,
     SUBPIX_CORNER_SIGMA_PX,
     refine_subpix,
 )
@@ -156,7 +156,7 @@ def test_what_is_no_square_or_flat_has_no_lines_and_keeps_near_to_the_raw_corner
         result = refine_subpix(image, raw, 6)
         assert not result.are_corners_fitted
         assert np.linalg.norm(result.corners_px - raw, axis=1).max() < most_px
-        assert result.sigma_px in (DETECTOR_CORNER_SIGMA_PX, SUBPIX_CORNER_SIGMA_PX)
+        assert result.sigma_px in (OPENCV_DETECTOR_CORNER_SIGMA_PX, SUBPIX_CORNER_SIGMA_PX)
     waves = waved(render(*POSE, noise=2.0))
     assert refine_corners_by_lines(waves, corners("large")[None], [RIMS[6]], CAMERA) == [None]
 
