@@ -202,12 +202,16 @@ class FreezeDetector:
 
     @property
     def only_attitude_frozen_for_s(self) -> float:
-        """Time, s, for which the attitude has not changed while the accelerometer has."""
+        """Time by which the attitude has been frozen for longer than the accelerometer, s: a large
+        one shows that only the attitude is frozen. It is 0 if the accelerometer has been frozen
+        for as long, and before the attitude's first change."""
         return max(0.0, self.attitude_frozen_for_s - self.acceleration_frozen_for_s)
 
     @property
     def only_position_frozen_for_s(self) -> float:
-        """Time, s, for which position and velocity have not changed while the accelerometer has."""
+        """Time by which position and velocity have been frozen for longer than the accelerometer,
+        s: a large one shows that only these are frozen. It is 0 if the accelerometer has been
+        frozen for as long, and before their first change."""
         return max(0.0, self.position_frozen_for_s - self.acceleration_frozen_for_s)
 
     def update_freeze(self, last: Telemetry | None, new: Telemetry) -> Self:
@@ -686,8 +690,8 @@ def _integrate_acceleration(
 
 
 class TiltError(NamedTuple):
-    """Error of the estimated roll and pitch (estimated minus true), rad, and the body's true rates
-    about both axes, rad/s."""
+    """Error of the estimated roll and pitch (estimated minus true), rad, and the rates of both
+    angles between the newest two samples without a correction of the estimate, rad/s."""
 
     roll_pitch_error_rad: tuple[float, float]
     body_roll_pitch_rate_radps: tuple[float, float]
@@ -696,11 +700,13 @@ class TiltError(NamedTuple):
 def _estimate_tilt_error(
     motion: ImuMotion, last: Telemetry, new: Telemetry, dt_s: float
 ) -> TiltError:
-    """Return the error of the estimated roll and pitch after the sample `new`, `dt_s` after `last`.
+    """Return the error of the estimated roll and pitch after the sample `new`, `dt_s` after `last`,
+    and the rates of roll and pitch.
 
-    If the lateral velocity steps within one sample, the estimate has been corrected, and its
-    attitude with it. The rotation in that sample that the previous body rates do not explain is
-    then added to the error, which decays as the firmware's filter removes it.
+    If the lateral velocity steps from `last` to `new`, the estimate has been corrected, and its
+    attitude with it. The rotation between the samples that the previous rates do not explain is
+    then added to the error, and the previous rates are kept. The error decays as the firmware's
+    filter removes it.
     """
     gained_mps = math.dist(new.velocity_mps[:2], last.velocity_mps[:2])
     turned = (new.roll_rad - last.roll_rad, new.pitch_rad - last.pitch_rad)

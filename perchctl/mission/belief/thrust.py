@@ -81,9 +81,10 @@ class HoverThrust:
         )
 
     def with_measurement(self, thrust: float, dt_s: float) -> HoverThrust:
-        """Return the estimate after a Kalman update with `thrust`, the mean thrust over `dt_s`,
-        0..65535. A longer time gives the measurement more weight; if `dt_s` is 0, nothing
-        changes."""
+        """Return the estimate after a Kalman update with `thrust`, the hover thrust measured as a
+        mean over `dt_s`, 0..65535. A longer time gives the measurement more weight; if `dt_s` is 0,
+        nothing changes. An estimate whose `sigma_fraction` is inf is replaced by the
+        measurement."""
         if dt_s <= 0.0:
             return self
         if math.isinf(self.sigma_fraction):
