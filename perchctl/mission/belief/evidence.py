@@ -61,7 +61,7 @@ def update_condition_start_times(
     return {each: old.get(each, now_s) for each in conditions if each.predicate(condition_input)}
 
 
-def keep_persistent_start_times(
+def keep_start_times_across_phases(
     condition_start_times_s: ConditionStartTimes,
 ) -> dict[Condition, float]:  # type: ignore[type-arg]
     """Return the start times of those conditions that do not restart when the phase changes or a

@@ -104,7 +104,7 @@ MIN_LATERAL_PUSH_G = 0.06
 push."""
 MAX_PUSH_TO_ESTIMATE_RESPONSE_DELAY_S = 1.5
 """Longest time until a push shows in the state estimate, s."""
-LATERAL_PUSH_TIME_CONSTANT_S = 0.05
+LATERAL_PUSH_FILTER_TIME_CONSTANT_S = 0.05
 """Time constant of the mean lateral force, s: the vibration of running motors affects single
 samples as much as a push does."""
 MIN_VELOCITY_STEP_OF_ESTIMATE_CORRECTION_MPS = 0.08
@@ -122,7 +122,7 @@ MIN_HOVER_TO_FULL_THRUST_RATIO = 0.4
 MAX_UNSATURATED_TO_FULL_THRUST_RATIO = 0.95
 """Fraction of full thrust above which the motors are saturated and the thrust for 1 g is
 unknown."""
-MIN_VARIANCE_GROWTH_WITHOUT_FUSION_M2PS2_PER_S = 5e-4
+MIN_CLIMB_VARIANCE_GROWTH_WITHOUT_FUSION_M2PS2_PER_S = 5e-4
 """Smallest growth of the vertical speed's variance that shows that corrections are missing, (m/s)^2
 per second: half of its growth without any corrections."""
 NO_FUSION_TIMEOUT_S = 0.45
@@ -148,11 +148,11 @@ class FusionAge:
     def update(self, sample: Telemetry) -> FusionAge:
         """Return the age after one more sample; unchanged if the sample has no new variance. A new
         variance shows a correction if it has grown more slowly than
-        `MIN_VARIANCE_GROWTH_WITHOUT_FUSION_M2PS2_PER_S`."""
+        `MIN_CLIMB_VARIANCE_GROWTH_WITHOUT_FUSION_M2PS2_PER_S`."""
         variance, before = sample.climb_variance_m2ps2, self.climb_variance_m2ps2
         if variance is None or variance == before:
             return self
-        least = MIN_VARIANCE_GROWTH_WITHOUT_FUSION_M2PS2_PER_S * (
+        least = MIN_CLIMB_VARIANCE_GROWTH_WITHOUT_FUSION_M2PS2_PER_S * (
             sample.t_s - self.variance_changed_at_s
         )
         grows = before is not None and variance - before >= least
@@ -257,11 +257,11 @@ class FallDetector:
     up_acceleration_offset_mps2: float = 0.0
 
     def update_fall(
-        self, t_s: float, up_acceleration_mps2: float, acc_z_g: float, dt_s: float
+        self, t_s: float, up_acceleration_mps2: float, specific_force_body_z_g: float, dt_s: float
     ) -> Self:
         """Return the detector at `t_s`, after `dt_s` of vertical acceleration
-        `up_acceleration_mps2` (world z, without gravity). `acc_z_g` is the specific force along the
-        body's z axis at `t_s`."""
+        `up_acceleration_mps2` (world z, without gravity). `specific_force_body_z_g` is the
+        specific force along the body's z axis at `t_s`."""
         offset = self.up_acceleration_offset_mps2 + (
             max(
                 MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G * GRAVITY_MPS2,
@@ -280,7 +280,7 @@ class FallDetector:
         )
         light = (
             min(self.low_g_began_at_s, t_s)
-            if acc_z_g < MAX_ACCELEROMETER_READING_IN_FREE_FALL_G
+            if specific_force_body_z_g < MAX_ACCELEROMETER_READING_IN_FREE_FALL_G
             else math.inf
         )
         fell = (
@@ -315,14 +315,14 @@ class ImpactDetector:
     def update_impact(
         self,
         newest_impact_candidate: Impact,
-        world_z_m: float,
+        vehicle_world_z_m: float,
         up_acceleration_mps2: float,
         dt_s: float,
     ) -> Self:
         """Return the detector after `dt_s` of vertical acceleration `up_acceleration_mps2` (world
         z, without gravity). `newest_impact_candidate` describes the sample at the end of that time
         as if an impact began there: its time, its climb rates and its specific force, but no
-        height. `world_z_m` is the estimated height, world z, at that sample."""
+        height. `vehicle_world_z_m` is the estimated height, world z, at that sample."""
         upward_speed_gained_mps = max(
             0.0,
             self.upward_speed_gained_mps
@@ -345,7 +345,7 @@ class ImpactDetector:
             newest_impact=_update_newest_impact(
                 self.newest_impact,
                 newest_impact_candidate,
-                world_z_m,
+                vehicle_world_z_m,
                 recent_samples,
                 upward_speed_gained_mps,
             ),
@@ -355,7 +355,7 @@ class ImpactDetector:
 def _update_newest_impact(
     old: Impact,
     newest_impact_candidate: Impact,
-    world_z_m: float,
+    vehicle_world_z_m: float,
     recent_impact_candidates: tuple[Impact, ...],
     upward_speed_gained_mps: float,
 ) -> Impact:
@@ -364,7 +364,7 @@ def _update_newest_impact(
     `newest_impact_candidate` holds the sample's time, its two climb rates (from the state estimate
     and from the accelerometer, m/s) and its specific force along the body's z axis (g), but no
     height. `recent_impact_candidates` holds such samples from the last
-    `MAX_IMPACT_DETECTION_DELAY_S`, including `newest_impact_candidate`. `world_z_m` is the
+    `MAX_IMPACT_DETECTION_DELAY_S`, including `newest_impact_candidate`. `vehicle_world_z_m` is the
     estimated height of the vehicle at the newest sample.
 
     An impact is detected while `upward_speed_gained_mps` exceeds `MIN_FLOOR_IMPACT_SPEED_GAIN_MPS`:
@@ -388,7 +388,7 @@ def _update_newest_impact(
             min(moment.estimated_climb_before_impact_mps for moment in recent_impact_candidates),
             min(moment.imu_climb_before_impact_mps for moment in recent_impact_candidates),
             max(moment.peak_acc_z_g for moment in recent_impact_candidates),
-            world_z_m,
+            vehicle_world_z_m,
         )
         if not follows:
             return begun
@@ -461,7 +461,7 @@ class SteadySpeedDetector:
 class LateralPushDetector:
     """Detector of lateral pushes. A push is a specific force perpendicular to the body's z axis
     that exceeds `MIN_LATERAL_PUSH_G`, more than drag in flight causes, on average over
-    `LATERAL_PUSH_TIME_CONSTANT_S`."""
+    `LATERAL_PUSH_FILTER_TIME_CONSTANT_S`."""
 
     mean_specific_force_body_xy_g: tuple[float, float] = (0.0, 0.0)  # mean lateral force, body axes
     last_lateral_push_at_s: float = -math.inf  # time of the last lateral push
@@ -472,7 +472,7 @@ class LateralPushDetector:
         """Return the detector after the sample `new`, taken `dt_s` after the previous one.
         `accelerometer_offset_g`, the accelerometer's offset at rest in body axes, is subtracted
         from the sample's specific force."""
-        keeps = math.exp(-dt_s / LATERAL_PUSH_TIME_CONSTANT_S)
+        keeps = math.exp(-dt_s / LATERAL_PUSH_FILTER_TIME_CONSTANT_S)
         x_g, y_g = new.acc_x_g - accelerometer_offset_g[0], new.acc_y_g - accelerometer_offset_g[1]
         mean_x_g, mean_y_g = self.mean_specific_force_body_xy_g
         mean_specific_force_body_xy_g = (
@@ -745,7 +745,7 @@ def _update_frozen_time_s(
     )
 
 
-def _filter_hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
+def _filter_hover_thrust(old_hover_thrust: float, sample: Telemetry, dt_s: float) -> float:
     flies = (
         sample.has_bit(FLYING)
         and sample.thrust < MAX_UNSATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
@@ -755,22 +755,23 @@ def _filter_hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
         or sample.thrust < MIN_HOVER_TO_FULL_THRUST_RATIO * FULL_THRUST
         or not 0.8 <= sample.acc_z_g <= 1.2
     ):
-        return old
+        return old_hover_thrust
     measured = sample.thrust / sample.acc_z_g
     return (
         measured
-        if old == 0.0
-        else old + (measured - old) * min(1.0, dt_s / MEAN_HOVER_THRUST_TIME_CONSTANT_S)
+        if old_hover_thrust == 0.0
+        else old_hover_thrust
+        + (measured - old_hover_thrust) * min(1.0, dt_s / MEAN_HOVER_THRUST_TIME_CONSTANT_S)
     )
 
 
 def _filter_accelerometer_offset(
-    old: Vector, sample: Telemetry, new_sample_weight: float
+    old_offset_g: Vector, sample: Telemetry, new_sample_weight: float
 ) -> Vector:
     cr, sr = math.cos(sample.roll_rad), math.sin(sample.roll_rad)
     cp, sp = math.cos(sample.pitch_rad), math.sin(sample.pitch_rad)
     x, y, z = sample.acc_x_g + sp, sample.acc_y_g - cp * sr, sample.acc_z_g - cp * cr
-    ox, oy, oz = old
+    ox, oy, oz = old_offset_g
     return (
         ox + new_sample_weight * (x - ox),
         oy + new_sample_weight * (y - oy),

@@ -80,20 +80,23 @@ class HoverThrust:
             ),
         )
 
-    def with_measurement(self, thrust: float, dt_s: float) -> HoverThrust:
-        """Return the estimate after a Kalman update with `thrust`, the hover thrust measured as a
-        mean over `dt_s`, 0..65535. A longer time gives the measurement more weight; if `dt_s` is 0,
-        nothing changes. An estimate whose `sigma_fraction` is inf is replaced by the
-        measurement."""
-        if dt_s <= 0.0:
+    def with_measurement(self, mean_thrust: float, averaging_time_s: float) -> HoverThrust:
+        """Return the estimate after a Kalman update with `mean_thrust`, the hover thrust measured
+        as a mean over `averaging_time_s`, 0..65535. A longer time gives the measurement more
+        weight; if it is 0, nothing changes. An estimate whose `sigma_fraction` is inf is replaced
+        by the measurement."""
+        if averaging_time_s <= 0.0:
             return self
         if math.isinf(self.sigma_fraction):
             return replace(
                 self,
-                thrust=thrust,
-                sigma_fraction=ONE_SECOND_MEAN_HOVER_THRUST_SIGMA_FRACTION / math.sqrt(dt_s),
+                thrust=mean_thrust,
+                sigma_fraction=ONE_SECOND_MEAN_HOVER_THRUST_SIGMA_FRACTION
+                / math.sqrt(averaging_time_s),
             )
         variance = self.sigma_fraction**2
-        gain = variance / (variance + ONE_SECOND_MEAN_HOVER_THRUST_SIGMA_FRACTION**2 / dt_s)
-        corrected = self.thrust + gain * (thrust - self.thrust)
+        gain = variance / (
+            variance + ONE_SECOND_MEAN_HOVER_THRUST_SIGMA_FRACTION**2 / averaging_time_s
+        )
+        corrected = self.thrust + gain * (mean_thrust - self.thrust)
         return replace(self, thrust=corrected, sigma_fraction=math.sqrt((1.0 - gain) * variance))

@@ -36,7 +36,7 @@ from perchctl.mission.belief.contact import (
 )
 from perchctl.mission.belief.evidence import (
     Condition,
-    keep_persistent_start_times,
+    keep_start_times_across_phases,
     update_condition_start_times,
 )
 from perchctl.mission.belief.lateral_offset import LateralMotionSample
@@ -148,7 +148,7 @@ def reset_phase_dependent_conditions(b: Belief) -> Belief:
     """Return the belief after a change of maneuver: the times since when conditions have been true
     are forgotten, except for conditions that persist across phases."""
     return replace(
-        b, condition_start_times_s=keep_persistent_start_times(b.condition_start_times_s)
+        b, condition_start_times_s=keep_start_times_across_phases(b.condition_start_times_s)
     )
 
 
@@ -198,7 +198,7 @@ def _reset_conditions_after_tick_gap(b: Belief) -> Belief:
     since a later time at which they stopped. With the target as the only position source, the
     position counts as stale in this tick."""
     imu = b.obs.imu
-    kept: dict[Condition[Any], float] = keep_persistent_start_times(b.condition_start_times_s)
+    kept: dict[Condition[Any], float] = keep_start_times_across_phases(b.condition_start_times_s)
     off_s = max(imu.motors_stopped_at_s, imu.last_telemetry_gap_ended_at_s)
     if MOTORS_OFF_AS_COMMANDED in b.condition_start_times_s and math.isfinite(off_s):
         # All samples from the gap have arrived, and the motors are off in each. If this condition
@@ -534,7 +534,7 @@ def _update_estimators(b: Belief) -> Belief:
     )
     if held:
         # a hold interrupts the evidence
-        condition_start_times_s = keep_persistent_start_times(condition_start_times_s)
+        condition_start_times_s = keep_start_times_across_phases(condition_start_times_s)
     dt_s = max(0.0, obs.t_s - b.t_s)
     last_s = obs.telemetry.t_s - dt_s if b.last_telemetry is None else b.last_telemetry.t_s
     # 0: no new sample
