@@ -75,9 +75,9 @@ def find_expected_blurred_marker(
     shifted to where its drawing correlates best with the image, and then fitted (`align_marker`).
     Return the first marker that the fit confirms, or an empty dict if there is none.
 
-    The caller increments `initial_blur_alternation_counter` with each frame. To save time, the fits
-    start with a small blur if the counter is even and with a large blur if it is odd. If the
-    counter is None, both are tried in this frame.
+    `initial_blur_alternation_counter` is the number of earlier frames, since the markers were lost,
+    in which this function was tried. To save time, the fits start with a small blur if this number
+    is even and with a large blur if it is odd. If it is None, both are tried in this frame.
     """
     image, patterns = detector_input.image, detector_input.setup.patterns
     blurs_px = (
@@ -301,10 +301,11 @@ def is_alignment_confirmed(
     """True if the image matches the fitted drawing, and if the standard deviation of the corners is
     below `max_corner_sigma_sides` side lengths. To match, the image must correlate with the drawing
     and with its inner pattern, the contrast of the pattern must be similar to that of the border,
-    and no cell may deviate much from its grey in the drawing.
+    and no cell may deviate much from its grey in the drawing. Another marker that differs in one
+    bit may still match (`are_other_codewords_excluded`).
 
-    If there is no marker, the correlation of the inner pattern stays below 0.72 at any plausible
-    contrast; if there is one, it is above 0.95.
+    In tests without a marker, the correlation with the inner pattern stayed below 0.72 at any
+    plausible contrast; with a marker, it was above 0.95.
     """
     return (
         alignment.pattern_correlation > _MIN_PATTERN_CORRELATION
@@ -320,12 +321,11 @@ def is_alignment_confirmed(
 
 def are_other_codewords_excluded(alignment: DrawingAlignment) -> bool:
     """True if flipping any single bit of the codeword would make the drawing fit the image clearly
-    worse. How much a cell looks like the opposite colour is measured from 0 (as drawn) to 1
-    (flipped). For the worst cell, this `worst_cell_flip_fraction` must be below
-    `_MAX_CELL_FLIP_FRACTION`, and its standard deviation must be below
-    `_MAX_CELL_FLIP_FRACTION_SIGMA` for every cell. In tests, `is_alignment_confirmed` wrongly
-    accepted 36 markers with other codewords; each of these had a `worst_cell_flip_fraction` above
-    0.5."""
+    worse. How much each cell looks like the opposite colour is measured from 0 (as drawn) to 1
+    (flipped). This measure must be below `_MAX_CELL_FLIP_FRACTION`, and its standard
+    deviation below `_MAX_CELL_FLIP_FRACTION_SIGMA`, for every cell. In tests,
+    `is_alignment_confirmed` wrongly accepted 36 markers with other codewords; in each of them, the
+    measure was above 0.5 for at least one cell."""
     return (
         alignment.worst_cell_flip_fraction < _MAX_CELL_FLIP_FRACTION
         and alignment.largest_cell_flip_fraction_sigma < _MAX_CELL_FLIP_FRACTION_SIGMA

@@ -100,17 +100,19 @@ class DetectionPrior:
             expected.
         expected_corners_both_markers_px: the predicted corners of both markers, each (4, 2) px; a
             missing marker is derived from the other one. Empty if no target is expected.
-        search_mode: the kinds of search for this frame.
-        initial_blur_alternation_counter: counter whose parity selects a small (even) or a large
-            (odd) initial blur for the fits to blurred markers; None to try both (see
-            `find_expected_blurred_marker`).
+        search_mode: the kinds of search to use in this frame (`SearchMode`).
+        initial_blur_alternation_counter: number of earlier frames, since the markers were lost, in
+            which fits to blurred markers were tried at the expected position. If it is even, the
+            fits in this frame start with a small blur; if it is odd, with a large one. None to try
+            both.
         was_target_seen_recently: True if a marker was found at most
             `MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S` before this frame; always False if edge fits
             are disabled.
         was_target_truncated: True if `was_target_seen_recently` is True and the image border
             truncated every marker that was detected last.
-        previous_edge_shift: how far white has grown over black (blooming), measured in a recent
-            frame; None if it must be measured in this frame.
+        previous_edge_shift: how far white has grown over black (blooming), in pixels, with its
+            standard deviation, as measured in a recent frame; None if it must be measured in this
+            frame.
         measure_marker_to_own_target_distance_m: function that returns a marker's horizontal
             distance, m, from the expected position of this vehicle's own target. It selects one of
             several targets if none is expected at a known position. None if only the image is used
@@ -129,8 +131,9 @@ class DetectionPrior:
 
 @dataclass(frozen=True, eq=False)
 class CornerResults:
-    """Results of the corner methods tried so far: the refined `corners` of each marker, and
-    `search_result`, the raw corners from the last search."""
+    """Results of the corner methods tried so far on an image: the refined `corners` of each marker
+    that was found, and `search_result`, the unrefined result of the last search with OpenCV's
+    detector, which is empty if no search has run."""
 
     corners: dict[MarkerName, RefinedCorners] = field(default_factory=dict)
     search_result: FoundMarkers = field(default_factory=FoundMarkers)
@@ -400,14 +403,23 @@ def detect_markers(
     frames_without_markers: int | None = None,
     measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None = None,
 ) -> Detections:
-    """Find and refine the target's markers in one frame.
+    """Find the target's markers in one frame and measure their corners. A marker that is not found
+    is None in the result.
 
-    The search starts at `expected_corners_px`, each (4, 2) in the distorted image, predicted from
-    the vehicle's motion, or otherwise near the `previous` detections. The kinds of search alternate
-    depending on `frames_without_markers`, the number of successive frames without a marker. If it
-    is None, as for the first frame, all kinds of search are used. If no target is expected,
-    `measure_marker_to_own_target_distance_m` chooses one of several targets. For a frame of two
-    fields, the result is the mean of the fields.
+    Args:
+        frame: the image and its time. In a frame that consists of two interlaced fields, the
+            markers are found in each field, and their corners are averaged.
+        previous: detections in the previous frame; None for the first frame.
+        setup: the target's markers and the options of the detector.
+        camera: camera model, including lens distortion.
+        expected_corners_px: corners (4, 2) of each marker in the distorted image, predicted by the
+            caller. If None or empty, they are extrapolated from `previous`.
+        frames_without_markers: number of successive frames before this one without a marker.
+            The kinds of search alternate depending on this number. If None, all kinds of search
+            are used.
+        measure_marker_to_own_target_distance_m: function that returns a marker's distance from this
+            vehicle's own target. If several targets are in view and none is expected at a known
+            position, it selects one. None to select a target from the image only.
     """
     prior = make_detection_prior(
         frame,
@@ -503,11 +515,18 @@ def _detect_with_prior(
 def _choose_search_mode(
     frames_without_markers: int | None, is_target_expected: bool, is_line_fit_enabled: bool
 ) -> SearchMode:
-    """Return the kind of search for this frame. If a target is expected and the previous frame
-    showed a marker, the search is near the expected corners. Otherwise, to save time, the kinds of
-    search alternate from frame to frame. If no target is expected, or if `is_line_fit_enabled` is
-    False, the whole image is searched; in the latter case, only for sharp markers. If
-    `frames_without_markers` is None, all kinds are selected regardless of the other arguments."""
+    """Return the kind of search to use in this frame. The first of these cases that applies
+    determines the result:
+
+    - `frames_without_markers` is None: "all".
+    - Line fits are disabled: "whole_sharp".
+    - A target is expected, and the previous frame showed a marker (`frames_without_markers` is 0):
+      "near_expected".
+    - A target is expected, but no marker was found in the last `frames_without_markers` frames:
+      "whole_sharp" if this number is odd; otherwise "expected_fits" and "expected_window" in turn.
+    - No target is expected: "whole_blurred" after every `DetectorConfig.blurred_every` frames
+      without markers, otherwise "whole_sharp".
+    """
     if frames_without_markers is None:
         return "all"
     if not is_line_fit_enabled or (is_target_expected and frames_without_markers % 2):
@@ -540,10 +559,15 @@ def _is_marker_missing(
 
 
 def _refine_found_markers(detector_input: DetectorInput, found: FoundMarkers) -> _FoundCorners:
-    """Refine the raw corners from a search with the edge fit or, if it fails, with subpixel
-    refinement. Markers that are truncated or hidden are measured with the partial-view fit, because
-    a search mistakes the image border for a side of the marker. The photometric fit follows if the
-    edges are not accurate enough."""
+    """Refine the raw corners from a search, and return the markers that could be measured. Each
+    marker is measured with the edge fit or, if this fails, with subpixel refinement. If line fits
+    are disabled, only subpixel refinement is used, and nothing else follows.
+
+    A marker that is truncated or hidden, or that the edge fit could not measure, is measured with
+    the partial-view fit if possible, because a search may mistake the image border for a side. If
+    this fails too, a truncated or hidden marker is omitted. The photometric fit follows if the
+    edges are not accurate enough.
+    """
     image, setup = detector_input.image, detector_input.setup
     raw = {name: found.corners_px[name] for name in MARKERS if name in found.corners_px}
     lines = fit_side_lines(detector_input, raw) if setup.is_line_fit_enabled else {}
@@ -678,11 +702,13 @@ def is_line_fit_accurate(corners: RefinedCorners, pattern: MarkerPattern) -> boo
 def refine_photometrically(
     detector_input: DetectorInput, found_corners: _FoundCorners, is_from_search: bool = False
 ) -> _FoundCorners:
-    """Fit the drawing to each marker in `found_corners` whose edge fit is not accurate enough. If
-    only one marker was found, locate the other one from it, and add it if it is visible.
+    """Return `found_corners` with more accurate corners: the marker's drawing is fitted to the
+    image for each marker whose edge fit is not accurate enough. If the fit fails, the marker keeps
+    its corners. If only one marker was found, the other one is located from it, and added if the
+    image shows it.
 
-    If `is_from_search` is True, a single marker is dropped unless its edge fit is accurate enough
-    or the drawing confirms it.
+    If `is_from_search` is True, the markers were decoded by a search, and their positions were not
+    predicted. A single marker is then dropped if its drawing was fitted but does not match.
     """
     image, patterns, better = (
         detector_input.image,
@@ -773,12 +799,12 @@ def fit_side_lines(
     known_edge_shift: EdgeShift | None = None,
 ) -> _FoundCorners:
     """Fit the four sides of each marker, starting at `start_corners_px` (4, 2) in the distorted
-    image, and return the markers whose four sides are straight. This function does not check the
-    cells.
+    image, and return the markers whose four sides are straight. The cells are not checked, so a
+    result may be a square of any other content.
 
     All markers are fitted together, because blooming and gamma move all edges of an image by the
-    same number of pixels. `known_edge_shift` is how far white has grown over black; if it is None,
-    the growth is measured.
+    same number of pixels. `known_edge_shift` is how far white has grown over black, px, and its
+    standard deviation; if it is None, the growth is measured.
     """
     if not start_corners_px:
         return {}
@@ -804,7 +830,8 @@ def refine_expected_markers(
 
     A marker is omitted if it is more than 0.85 cells (at most 7 px) from its expected position, if
     it is truncated or hidden, or if its cells are smaller than 2.5 px. `known_edge_shift` is how
-    far white has grown over black; if it is None, the growth is measured.
+    far white has grown over black, px, and its standard deviation; if it is None, the growth is
+    measured.
     """
     image, patterns = detector_input.image, detector_input.setup.patterns
     start_corners_px = {
@@ -836,7 +863,8 @@ def add_partly_visible_markers(
 
     If the small marker was found, the large one is expected around it. If only the large marker is
     found, the small one is derived from it and added if the image resembles it. `known_edge_shift`
-    is how far white has grown over black at all edges; if it is None, the growth is measured.
+    is how far white has grown over black at all edges, px, and its standard deviation; if it is
+    None, the growth is measured.
     """
     start_corners_px, found_corners = dict(expected_corners_px), dict(found_corners)
     if "small" in found_corners and "large" not in found_corners:

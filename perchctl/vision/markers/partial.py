@@ -99,9 +99,9 @@ def fit_partly_visible_marker(
 
     `identified_by` is the evidence for the marker's identity: its own cells alone ("bits"), the
     predicted position ("track") or the other marker ("other_marker"). This evidence determines how
-    many visible cells must match. `known_edge_shift` is how far white has grown over black, or None
-    if it has not been measured. Returns None if the visible part does not determine the corners, or
-    if its cells do not match the marker.
+    many visible cells must match. `known_edge_shift` is how far white has grown over black, px, and
+    its standard deviation, or None if it has not been measured. Returns None if the visible part
+    does not determine the corners, or if its cells do not match the marker.
     """
     pattern, camera = detector_input.setup.patterns[name], detector_input.camera
     if (
@@ -153,9 +153,9 @@ def fit_partly_visible_marker(
 
 
 def is_fully_visible(detector_input: DetectorInput, corners: RefinedCorners) -> bool:
-    """True if no part of the marker is hidden and all its corners are inside the image, at least
-    `IMAGE_BORDER_MARGIN_PX` plus the standard deviation of the blurriest side's blur away from its
-    border."""
+    """True if no part of the marker is hidden, and all its corners are inside the image and far
+    enough from the image border: at least `IMAGE_BORDER_MARGIN_PX` plus the standard deviation, px,
+    of the blur of the marker's blurriest side."""
     margin_px = IMAGE_BORDER_MARGIN_PX + corners.blurriest_side_blur_sigma_px
     return is_inside_image(
         corners.corners_px, detector_input.image.shape, margin_px
@@ -165,13 +165,14 @@ def is_fully_visible(detector_input: DetectorInput, corners: RefinedCorners) -> 
 def _make_edge_normal_equations(
     visible_edges: VisibleEdges, edge_shift_prior: EdgeShift
 ) -> tuple[Array, Array, Array]:
-    """Linearise the offsets of the edges, px, with respect to nine unknowns: the increment of the
-    homography (8) and the shift of all edges (px, white over black). `edge_shift_prior` is the
-    expected shift and its standard deviation.
+    """Set up one Gauss-Newton step that moves the square to the visible edges, which are measured
+    with n profiles each. The nine unknowns x are the increment of the homography (8) and the
+    distance by which white has grown over black at all edges, px. `edge_shift_prior` is the
+    expected value of this distance and its standard deviation.
 
-    Returns the derivatives (9, rows * n) of the offsets, and the normal matrix N (9, 9) and the
-    right-hand side g (9,) of the normal equations N x = g for the unknowns x. The covariance of x
-    is the inverse of N times the variance of an edge, px^2.
+    Returns three arrays: the derivatives (9, edges * n) of the edges' outward offsets, px, with
+    respect to x, and the normal matrix N (9, 9) and the right-hand side g (9,) of the normal
+    equations N x = g. The covariance of x is the inverse of N times the variance of an edge, px^2.
     """
     u, v = visible_edges.points_half_sides[..., 0], visible_edges.points_half_sides[..., 1]
     nx, ny = (
@@ -212,13 +213,22 @@ def _make_refined_corners(
     pattern: MarkerPattern,
     camera: CameraModel,
 ) -> RefinedCorners | None:
-    """Return the marker's corners (4, 2) px in the distorted image, with their covariance (8, 8) in
-    pixels of a pinhole camera. `H_pinhole_marker` (3, 3) projects the marker's coordinates, in half
-    sides from its centre, to pixels of that pinhole camera. `residual_px` (rows, n) are the
-    residuals of the edges after the fit, and `normal_matrix` (9, 9) is the normal matrix of the
-    last step. Returns None if the blur fills a window, if the RMS residual is above
-    `_MAX_EDGE_FIT_RMS_RESIDUAL_PX`, or if the standard deviation of a corner is above
-    `_MAX_CORNER_SIGMA_SIDES` side lengths."""
+    """Return the result of a converged fit: the marker's corners (4, 2) px in the distorted image,
+    with their covariance (8, 8) in pixels^2 of a pinhole camera. Returns None if an edge is so
+    blurred that the window in which it was located does not contain it completely, if the RMS
+    residual is above `_MAX_EDGE_FIT_RMS_RESIDUAL_PX`, or if the standard deviation of a corner is
+    above `_MAX_CORNER_SIGMA_SIDES` side lengths.
+
+    Args:
+        H_pinhole_marker: homography (3, 3) that projects the marker's coordinates, in half sides
+            from its centre, to pixels of that pinhole camera.
+        visible_edges: the measured edges.
+        residual_px: distances (edges, n) of the n measured points of each edge from the fitted
+            square.
+        normal_matrix: normal matrix (9, 9) of the last step (`_make_edge_normal_equations`).
+        pattern: the marker's pattern.
+        camera: camera model, including lens distortion.
+    """
     w = visible_edges.weight
     mass = w.sum(axis=1)
     used = mass > 0.0
@@ -414,20 +424,23 @@ _WINDOW_SAMPLE_OFFSETS_HALF_LENGTHS: Array = np.linspace(
 
 @dataclass(frozen=True, eq=False)
 class VisibleEdges:
-    """Edges measured in one iteration of the fit: one row per visible edge, with n profiles in each
-    row.
+    """Edges of a marker (its sides and the inner edges of its border) measured in one iteration of
+    the fit. Each of the m visible edges is measured on n profiles, which are short lines across it
+    along which the image is sampled.
 
     Attributes:
-        points_half_sides: measured points (rows, n, 2), in half sides from the marker's centre.
-        outward_edge_offset_px: distance (rows, n) of each measured point from the edge of the
-            model, positive outwards.
-        weight: weight (rows, n) of each profile.
-        side_index: index of the edge's side, 0 to 3, (rows,).
-        edge_to_centre_half_sides: distance of the edge from the marker's centre: 1 for a side,
-            less for an inner edge of the border, (rows,).
-        px_per_half_side: image scale across the edge, (rows,).
-        blur_sigma_to_window_half_length_ratio: standard deviation of the blur divided by the half
-            length of the window, (rows,).
+        points_half_sides: measured point of the edge on each profile (m, n, 2), in half
+            sides from the marker's centre.
+        outward_edge_offset_px: distance (m, n) of each measured point from the edge as predicted by
+            the current homography, positive away from the marker's centre.
+        weight: weight (m, n) of each profile in the fit, 0 if it is not used.
+        side_index: index (m,) of the side to which the edge is parallel and adjacent, 0 to 3. Side
+            k runs from corner k to corner k + 1.
+        edge_to_centre_half_sides: distance (m,) of the edge from the marker's centre: 1
+            for a side, less for an inner edge of the border.
+        px_per_half_side: scale (m,) of the image across the edge.
+        blur_sigma_to_window_half_length_ratio: standard deviation of the edge's blur divided by
+            half the length of the window in which the edge is located, (m,).
         white_grey: grey level of white paper.
     """
 
@@ -566,13 +579,20 @@ def _find_clean_edge_profiles(
     window_half_length_px: Array,
     profile_half_length_px: Array,
 ) -> tuple[NDArray[np.bool_], float] | None:
-    """Return two values: for each profile (rows, n), whether it shows a clean step from black to
-    white, and the grey level of white paper. Returns None if the contrast is too low.
+    """Return two values: for each of the n profiles across each of the m edges, whether it shows a
+    clean step from black to white (m, n), and the grey level of white paper. Returns None if the
+    contrast is too low.
 
-    Black and white are the medians, over the profiles with `is_unobstructed` (rows, n), of the
-    greys on either side of the middle, at 0.6 times `window_half_length_px` (rows,). A clean
-    profile has nearly these greys there. `profile_greys` (rows, n, steps + 1) run from the dark to
-    the bright side, from -profile_half_length_px to +profile_half_length_px (rows,).
+    Black and white are the medians, over the unobstructed profiles, of the greys at 0.6 times
+    `window_half_length_px` on the dark and on the bright side of the profile's middle. A clean
+    profile has nearly these greys there.
+
+    Args:
+        profile_greys: grey values (m, n, samples) along each profile, from -profile_half_length_px
+            on the dark side to +profile_half_length_px on the bright side of its middle.
+        is_unobstructed: whether the profile (m, n) is in view and crosses a printed edge.
+        window_half_length_px: half the length (m,) of the window in which an edge is located.
+        profile_half_length_px: half the length (m,) of the profiles.
     """
     # At 0.6 times the half length of the window, the blur of the edge has faded and that of a
     # neighbouring edge has not begun.

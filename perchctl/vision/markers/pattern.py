@@ -35,14 +35,15 @@ _SAMPLE_OFFSETS_CELLS: Array = np.array(
 
 @dataclass(frozen=True, eq=False)
 class CellsAlongBorder:
-    """The row of cells just inside a marker's black border, along each of its four sides. Side k
-    runs from corner k to corner k + 1.
+    """The colours of the cells just inside a marker's black border, along each of its four sides.
+    Side k runs from corner k to corner k + 1 and is n cells long, including the border's own cells
+    at both ends, which count as black.
 
     Attributes:
-        is_first_inner_cell_white: 1 for a white cell and 0 for a black one (4, n), for use as
-            factors in sums. The first and last cells of a side belong to the border.
-        are_first_two_inner_cells_white: 1 if both this cell and the next one further in are white,
-            otherwise 0 (4, n).
+        is_first_inner_cell_white: 1.0 if the cell next to the border is white, 0.0 if it is
+            black, at each position along each side (4, n).
+        are_first_two_inner_cells_white: 1.0 if that cell and the next one towards the marker's
+            centre are both white, otherwise 0.0 (4, n).
         print_tolerance_cells: standard deviation of a printed edge's position, in cells.
     """
 
@@ -145,8 +146,8 @@ def make_marker_pattern(
 def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern) -> bool:
     """True if every cell of a marker with corners (4, 2) px in the image clearly has the colour of
     its cell in the pattern: its mean grey is on the right side of the middle between the medians of
-    black and white, by at least `MIN_CELL_MARGIN_TO_CONTRAST_RATIO` of the contrast. False if the
-    contrast is below `MIN_CONTRAST_GREY` or the marker is partly outside the image."""
+    black and white, by at least `MIN_CELL_MARGIN_TO_CONTRAST_RATIO` of the contrast. False if
+    the contrast is below `MIN_CONTRAST_GREY` or the marker is partly outside the image."""
     means = _mean_grey_per_cell(image, corners_px, pattern)
     if means is None:
         return False
@@ -256,16 +257,21 @@ BLUR_MARGIN_NODES = 12
 
 @dataclass(frozen=True, eq=False)
 class MarkerDrawing:
-    """The cells of a marker with its border, `cell_whiteness` (n, n): 1 for white, 0 for black.
+    """What is printed on the paper: a marker and, if it is the large one, the small marker in its
+    centre, which a white square ring surrounds. Lengths are in half sides of this marker.
 
-    The drawing of the large marker also contains the small marker: `small_marker_cell_whiteness`
-    are the cells of the small marker, and `small_to_large_side_ratio` is its side divided by the
-    side of the large marker. Nothing of the large marker is printed up to
-    `white_ring_reach_half_sides` from the centre, the outer edge of the white ring around the small
-    marker.
-
-    `paper_reach_half_sides` is half the side of the paper in the marker's coordinates; None if the
-    paper is assumed to be infinite."""
+    Attributes:
+        cell_whiteness: 1 for a white cell, 0 for a black one (n, n), row by row from the top left,
+            including the black border.
+        small_marker_cell_whiteness: the same (m, m) for the small marker in the centre; None if
+            there is none.
+        small_to_large_side_ratio: side of the small marker divided by the side of this marker; 0 if
+            there is no small marker.
+        white_ring_reach_half_sides: distance from the centre to the outer edge of the
+            white ring. This marker's own cells are not printed any closer to the centre.
+        paper_reach_half_sides: distance from the centre to the edge of the square paper; None
+            if the paper is assumed to be infinite.
+    """
 
     cell_whiteness: Array
     small_marker_cell_whiteness: Array | None = None
@@ -293,9 +299,9 @@ def make_marker_drawing(
 
     - `small_marker_bits` (m, m): its inner bits, 1 = white.
     - `small_to_large_side_ratio`: its side divided by the side of the large marker.
-    - `white_ring_reach_half_sides`: the distance from the centre to the outer edge of the white
-      ring around it, in half sides of the large marker; if it is less than the half side of the
-      small marker, that half side is used.
+    - `white_ring_reach_half_sides`: the distance from the centre to the outer edge of
+      the white ring around it, in half sides of the large marker; if it is less than the half side
+      of the small marker, that half side is used.
 
     With a small marker, the paper ends one cell outside the border; without one, the paper is
     assumed to be infinite.
@@ -322,8 +328,9 @@ def _cell_coverage(
     """Return the fraction of each node's interval that each cell covers, (nodes, cells), along one
     axis. A node's interval extends `node_reach_half_sides` to each side of its position. The
     `cells_per_side` cells fill the interval from -square_reach_half_sides to
-    square_reach_half_sides; of each cell, only the part up to `max_counted_reach_half_sides` from
-    the centre counts. Lengths are in half sides from the marker's centre."""
+    square_reach_half_sides; of each cell, only the part up to
+    `max_counted_reach_half_sides` from the centre counts. Lengths are in half sides
+    from the marker's centre."""
     edges = square_reach_half_sides * np.linspace(-1.0, 1.0, cells_per_side + 1)
     edges = np.clip(edges, -max_counted_reach_half_sides, max_counted_reach_half_sides)
     low, high = (
@@ -356,8 +363,8 @@ def render_whiteness_and_off_paper_fraction(
     blur.
 
     The first array returned is the whiteness of each node, 0 to 1. If the drawing has a
-    `paper_reach_half_sides`, a second array contains the fraction of each node that is beyond the
-    paper.
+    `paper_reach_half_sides`, a second array contains the fraction of each node that is beyond
+    the paper.
     """
     node_reach_half_sides = drawing.photometric_fit_reach_half_sides / nodes_per_side
     node_positions_half_sides: Array = node_reach_half_sides * (
@@ -393,8 +400,9 @@ def render_cells(
     """Return the whiteness of the drawing, 0 to 1, at the nodes of a square grid, without blur. The
     nodes are at `node_positions_half_sides` (n,) along both axes, in half sides from the marker's
     centre, and the result also has a margin of m = `BLUR_MARGIN_NODES` nodes on all sides: (n + 2m,
-    n + 2m). Each value is the mean over the node's square, which extends `node_reach_half_sides`,
-    half the spacing, to each side. The surroundings of the marker are white."""
+    n + 2m). Each value is the mean over the node's square, which extends
+    `node_reach_half_sides`, half the spacing, to each side. The surroundings of the marker are
+    white."""
     wide = _add_margin_nodes(node_positions_half_sides, node_reach_half_sides)
     C = _cell_coverage(wide, node_reach_half_sides, len(drawing.cell_whiteness), 1.0)
     black = C @ (1.0 - drawing.cell_whiteness) @ C.T
@@ -424,10 +432,10 @@ def blurred_cell_coverage(
     node_reach_half_sides: float,
     blur_sigma_nodes: float,
 ) -> Array:
-    """Return the fraction (n, cells) of each node's interval that each row of cells covers, along
-    one axis, after a Gaussian blur with the standard deviation `blur_sigma_nodes`, in node
-    spacings. The nodes are at `node_positions_half_sides` (n,); their intervals extend
-    `node_reach_half_sides` to each side."""
+    """Return the fraction (n, cells) of each node's interval that each row of the drawing's cells
+    covers, along one axis, after a Gaussian blur with the standard deviation `blur_sigma_nodes`, in
+    node spacings. The nodes are at `node_positions_half_sides` (n,), in half sides from the
+    marker's centre; their intervals extend `node_reach_half_sides` to each side."""
     wide = _cell_coverage(
         _add_margin_nodes(node_positions_half_sides, node_reach_half_sides),
         node_reach_half_sides,

@@ -12,8 +12,9 @@ the drawing after the fit, the image does not show the marker.
 
 The result is wrong if the blur is anisotropic (fast motion), if something covers a part of the
 marker but leaves the cells readable, or if white is clipped. The fit itself does not notice if
-another codeword looks the same after this blur; `DrawingAlignment.worst_cell_flip_fraction` is a
-measure of how close another codeword is.
+another codeword looks the same after this blur;
+`DrawingAlignment.worst_cell_flip_fraction` is a measure of how close another codeword
+is.
 
 The coordinates u are the marker's own (see `perchctl.vision.markers.corners`). Grey values are 0 to
 255. Grids have (n, n) nodes, which are stored as rows of n * n values.
@@ -98,19 +99,21 @@ class DrawingAlignment:
     """Result of fitting a drawing to the image, with measures of the fit's quality.
 
     Attributes:
-        corners_px, sigma_px: the marker's corners (4, 2) in the distorted image, and their standard
-            deviation.
-        fit_correlation: correlation of the image with the fitted drawing.
-        pattern_correlation: correlation of the inner bits with the residual that a plain black
-            square of the same size leaves in the image.
-        pattern_to_border_contrast_ratio: contrast of the inner bits relative to the contrast of the
-            border.
+        corners_px: the marker's corners (4, 2) in the distorted image.
+        sigma_px: standard deviation of the corners.
+        fit_correlation: correlation, 0 to 1, of the image's grey values with those of the whole
+            fitted drawing.
+        pattern_correlation: correlation, -1 to 1, of the image with the inner pattern alone:
+            the best-fitting plain black square is first subtracted from both the image and the
+            drawing.
+        pattern_to_border_contrast_ratio: contrast of the inner pattern in the image, divided by the
+            contrast between black and white of the whole fitted drawing.
         largest_cell_grey_deviation_to_contrast_ratio: largest deviation of a cell's mean grey from
             its mean grey in the fitted drawing, relative to the contrast of black and white.
-        worst_cell_flip_fraction: how much the worst cell looks like the opposite colour, from 0 (as
-            drawn) to 1 (flipped bit).
-        largest_cell_flip_fraction_sigma: standard deviation of `worst_cell_flip_fraction` for the
-            least certain cell.
+        worst_cell_flip_fraction: how much the worst cell looks like the opposite colour,
+            from 0 (as drawn) to 1 (flipped bit).
+        largest_cell_flip_fraction_sigma: standard deviation of this measure for the cell in
+            which it is least certain.
         blur_sigma_px: standard deviation of the fitted blur.
         largest_motion_from_start_px: largest distance of a fitted corner from its start.
     """
@@ -339,14 +342,14 @@ def _measure_worst_cell_flip_fraction(
     inverse_normal_matrix: Array,
     nodes_per_independent_sample: float,
 ) -> tuple[float, float]:
-    """Return `worst_cell_flip_fraction` and `largest_cell_flip_fraction_sigma` of a
-    `DrawingAlignment`.
+    """Return how much the worst cell looks like the opposite colour, from 0 (as drawn) to 1
+    (flipped bit), and the standard deviation of this measure for the cell in which it is least
+    certain.
 
     Each cell's residual is projected onto the change that a flipped bit would cause: the blurred
-    cell, minus the part that the unknowns of the fit can absorb. The projection is 0 for a cell as
-    drawn and 1 for a flipped cell. `inverse_normal_matrix` is the inverse of the normal matrix in
-    `equations`; `nodes_per_independent_sample` is the result of
-    `_estimate_nodes_per_independent_sample`.
+    cell, minus the part that the unknowns of the fit can absorb. `inverse_normal_matrix` is the
+    inverse of the normal matrix in `equations`. `nodes_per_independent_sample` is the number of
+    neighbouring nodes that share one independent residual, by which the variance is multiplied.
     """
     soft, noise, contrast_grey = (
         rendered_drawing.blurred_cell_coverage,
@@ -464,8 +467,8 @@ class SamplingGrid:
 
 @lru_cache(maxsize=64)
 def make_sampling_grid(nodes_per_side: int, grid_reach_half_sides: float) -> SamplingGrid:
-    """Return a grid over the square from -grid_reach_half_sides to grid_reach_half_sides around the
-    marker's centre, with one node in the middle of each of its n by n equal parts
+    """Return a grid over the square from -grid_reach_half_sides to grid_reach_half_sides
+    around the marker's centre, with one node in the middle of each of its n by n equal parts
     (`nodes_per_side`)."""
     node_positions_half_sides = grid_reach_half_sides * (
         (2.0 * np.arange(nodes_per_side) + 1.0) / nodes_per_side - 1.0
@@ -595,10 +598,11 @@ OFFSET, OFFSET_U, OFFSET_V, GAIN, GAIN_U, GAIN_V, TONE_CURVE_BEND, OFF_PAPER_GRE
 
 @dataclass(frozen=True, eq=False)
 class RenderedDrawing:
-    """A marker's drawing at the nodes of `grid`, which lies in the marker's plane: its whiteness (0
-    black, 1 white) and the fraction of each node that is beyond the paper, before the illumination
-    turns them into grey values. Both are blurred by a Gaussian with the standard deviation
-    `blur_sigma_nodes`, in node spacings."""
+    """A marker's `drawing` at the nodes of `grid`, which lies in the marker's plane. The properties
+    are its whiteness (0 black, 1 white) and the fraction of each node that is beyond the paper,
+    blurred by a Gaussian with the standard deviation `blur_sigma_nodes`, in node spacings, and the
+    basis functions from which any illumination makes grey values. They are computed when they are
+    first used."""
 
     drawing: MarkerDrawing
     grid: SamplingGrid

@@ -56,9 +56,15 @@ ImageWindow = tuple[slice, slice]
 
 @dataclass(frozen=True, eq=False)
 class FoundMarkers:
-    """Result of a search: the raw corners, (4, 2) px in the distorted image, of at most one large
-    and one small marker, whether a marker was decoded as its mirror image (the camera image is
-    mirrored), and the number of complete targets in view."""
+    """Result of a search with OpenCV's detector.
+
+    Attributes:
+        corners_px: raw corners (4, 2), in the distorted image, of at most one large and one small
+            marker; empty if none was found.
+        is_mirrored_marker_seen: True if a marker was decoded as its mirror image, which means that
+            the camera image is mirrored.
+        target_count: number of complete targets found, each a large marker around a small one.
+    """
 
     corners_px: dict[MarkerName, Array] = field(default_factory=dict)
     is_mirrored_marker_seen: bool = False
@@ -225,12 +231,16 @@ def choose_markers(
     small_to_large_side_ratio: float,
     measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None = None,
 ) -> dict[MarkerName, Array]:
-    """Return at most one large and one small marker, corners (4, 2) px, from the `candidates` that
-    were decoded. The result is empty if it is not clear which candidate is the target's.
+    """Choose the target's markers from the decoded `candidates`, corners (4, 2) px, and return at
+    most one large and one small marker. The result is empty if it is not clear which candidates
+    belong to the target.
 
     A small marker with the right size and rotation in the centre of a large one confirms both
-    markers. Markers at expected positions take precedence over a pair elsewhere. Among single
-    markers, the one with the shortest `measure_marker_to_own_target_distance_m` is chosen.
+    markers. Markers at expected positions take precedence over such a pair elsewhere. If no
+    position is expected (`expected_corners_px` is empty), the candidates closest to this vehicle's
+    own target are chosen (`measure_marker_to_own_target_distance_m`). Otherwise, a large marker
+    without a pair is chosen only if it is the only large one, and a small marker only if it is the
+    only candidate.
     `small_to_large_side_ratio` is the side of the small marker divided by the side of the large
     one.
     """
