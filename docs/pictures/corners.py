@@ -103,7 +103,7 @@ def partial_view_fit(file: Path) -> None:
     H = homography_from_centred_square(undistort_px(_found(view), CAMERA))
     seen = find_visible_edges(view.picture, H, _LARGE)
     assert seen is not None
-    points = apply_homography(H, seen.points_half_sides[seen.weight > 0.0])
+    points = apply_homography(H, seen.measured_points_half_sides[seen.profile_weight > 0.0])
     at = distort_px(points.T, CAMERA).T
     _dots(whole, near, at, "edge in view")
     _finish(figure, file, whole, view)
@@ -121,8 +121,8 @@ def cut_view_fit(file: Path) -> None:
     small = SETUP.patterns["small"]
     outline = make_outline(
         _LARGE.drawing,
-        _LARGE.cells_along_border.print_tolerance_cells,
-        small.cells_along_border.print_tolerance_cells,
+        _LARGE.cells_along_border.print_edge_sigma_cells,
+        small.cells_along_border.print_edge_sigma_cells,
     )
     R, t = cv2.Rodrigues(view.pose[0])[0], view.pose[1] / 0.075
     start = RigidPose(np.asarray(R) @ np.diag([1.0, -1.0, -1.0]), t)
@@ -228,11 +228,11 @@ def _drawing(view: View, file: Path) -> None:
     fit = align_drawing(view.image, found, drawing, CAMERA, view.blur_px)
     assert fit is not None
     n = 44
-    grid = make_sampling_grid(n, drawing.photometric_fit_reach_half_sides)
+    grid = make_sampling_grid(n, drawing.photometric_fit_half_width_half_sides)
     H = homography_from_centred_square(undistort_px(fit.corners_px, CAMERA))
     x, y = distort_px(project_nodes(H, grid.node_uv1), CAMERA).astype(np.float32).reshape(2, n, n)
     grey = cv2.remap(view.image.astype(np.float32), x, y, cv2.INTER_LINEAR).ravel()
-    node_px = drawing.photometric_fit_reach_half_sides * mean_side_px(fit.corners_px) / n
+    node_px = drawing.photometric_fit_half_width_half_sides * mean_side_px(fit.corners_px) / n
     rows, _ = render_blurred(
         drawing, n, round(np.log(fit.blur_sigma_px / node_px) / 0.02)
     ).illumination_basis

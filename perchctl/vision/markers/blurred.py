@@ -63,31 +63,27 @@ _TEMPLATE_CENTRE_WHITENESS, _TEMPLATE_OUTSIDE_WHITENESS = 0.3, 0.6
 # Candidates closer to each other than this fraction of a side count as one.
 _MAX_DUPLICATE_DISTANCE_SIDES = 0.15
 # Distance from the marker's centre up to which the surroundings are certainly paper.
-_MIN_PAPER_REACH_HALF_SIDES = 1.3
+_MIN_PAPER_HALF_WIDTH_HALF_SIDES = 1.3
 
 
 def find_expected_blurred_marker(
     detector_input: DetectorInput,
     expected_corners_px: Mapping[MarkerName, Array],
-    initial_blur_alternation_counter: int | None = None,
+    blurred_fit_attempt_index: int | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
     """Find blurred markers near their expected corners (4, 2) px in the image. Each marker is
     shifted to where its drawing correlates best with the image, and then fitted (`align_marker`).
     Return the first marker that the fit confirms, or an empty dict if there is none.
 
-    `initial_blur_alternation_counter` is the number of earlier frames, since the markers were lost,
+    `blurred_fit_attempt_index` is the number of earlier frames, since the markers were lost,
     in which this function was tried. To save time, the fits start with a small blur if this number
     is even and with a large blur if it is odd. If it is None, both are tried in this frame.
     """
     image, patterns = detector_input.image, detector_input.setup.patterns
     blurs_px = (
         _INITIAL_BLUR_SIGMAS_PX
-        if initial_blur_alternation_counter is None
-        else (
-            _INITIAL_BLUR_SIGMAS_PX[
-                initial_blur_alternation_counter % len(_INITIAL_BLUR_SIGMAS_PX)
-            ],
-        )
+        if blurred_fit_attempt_index is None
+        else (_INITIAL_BLUR_SIGMAS_PX[blurred_fit_attempt_index % len(_INITIAL_BLUR_SIGMAS_PX)],)
     )
     for name in MARKERS:
         corners = expected_corners_px.get(name)
@@ -167,7 +163,7 @@ def _align_by_correlation(
     scale = min(1.0, _MAX_TEMPLATE_SIZE_PX / (2.0 * side_px))
     reach = max(_MAX_EXPECTED_POSITION_ERROR_PX, _MAX_EXPECTED_POSITION_ERROR_SIDES * side_px)
     centre = corners_px.mean(axis=0)
-    half = float(np.abs(corners_px - centre).max()) * _MIN_PAPER_REACH_HALF_SIDES
+    half = float(np.abs(corners_px - centre).max()) * _MIN_PAPER_HALF_WIDTH_HALF_SIDES
     h, w = image.shape
     low = np.clip(np.floor(centre - half - reach), 0, (w - 1, h - 1)).astype(int)
     high = np.clip(np.ceil(centre + half + reach) + 1, 1, (w, h)).astype(int)
@@ -208,7 +204,7 @@ def _render_template(
         white[
             np.abs(sample_points_half_sides).max(axis=2) < pattern.drawing.small_to_large_side_ratio
         ] = _TEMPLATE_CENTRE_WHITENESS
-    white[np.abs(sample_points_half_sides).max(axis=2) > _MIN_PAPER_REACH_HALF_SIDES] = (
+    white[np.abs(sample_points_half_sides).max(axis=2) > _MIN_PAPER_HALF_WIDTH_HALF_SIDES] = (
         _TEMPLATE_OUTSIDE_WHITENESS
     )
     sigma = max(1.0, 0.5 * side_px / n)
@@ -222,10 +218,10 @@ _MIN_ALIGNED_CORNER_SIGMA_PX = 0.015
 # The error of the corners grows with the blur, because no image equals its drawing with a uniform
 # blur.
 _CORNER_SIGMA_TO_BLUR_SIGMA_RATIO = 0.012
-_MIN_PATTERN_CORRELATION, _MIN_FIT_CORRELATION = 0.9, 0.9
+_MIN_INNER_PATTERN_CORRELATION, _MIN_FIT_CORRELATION = 0.9, 0.9
 _MIN_PATTERN_TO_BORDER_CONTRAST_RATIO, _MAX_PATTERN_TO_BORDER_CONTRAST_RATIO = 0.6, 1.6
 _MAX_CELL_GREY_DEVIATION_TO_CONTRAST_RATIO = 0.3
-_MAX_CELL_FLIP_FRACTION, _MAX_CELL_FLIP_FRACTION_SIGMA = 0.4, 0.35
+_MAX_OPPOSITE_COLOUR_LIKENESS, _MAX_OPPOSITE_COLOUR_LIKENESS_SIGMA = 0.4, 0.35
 _MAX_ALIGNED_CORNER_SIGMA_SIDES = 0.06
 _ALWAYS_ALLOWED_MOTION_FROM_START_PX = 3.0
 # Limits of the mean side after the fit, divided by the mean side at its start.
@@ -281,7 +277,7 @@ def align_marker(
     ):
         return None
     sigma_px = math.hypot(
-        max(alignment.sigma_px, _MIN_ALIGNED_CORNER_SIGMA_PX),
+        max(alignment.corner_sigma_px, _MIN_ALIGNED_CORNER_SIGMA_PX),
         _CORNER_SIGMA_TO_BLUR_SIGMA_RATIO * alignment.blur_sigma_px,
     )
     (left, top), (right, bottom) = (
@@ -308,25 +304,25 @@ def is_alignment_confirmed(
     plausible contrast; with a marker, it was above 0.95.
     """
     return (
-        alignment.pattern_correlation > _MIN_PATTERN_CORRELATION
+        alignment.inner_pattern_correlation > _MIN_INNER_PATTERN_CORRELATION
         and alignment.fit_correlation > _MIN_FIT_CORRELATION
         and _MIN_PATTERN_TO_BORDER_CONTRAST_RATIO
         < alignment.pattern_to_border_contrast_ratio
         < _MAX_PATTERN_TO_BORDER_CONTRAST_RATIO
         and alignment.largest_cell_grey_deviation_to_contrast_ratio
         < _MAX_CELL_GREY_DEVIATION_TO_CONTRAST_RATIO
-        and alignment.sigma_px < max_corner_sigma_sides * mean_side_px(alignment.corners_px)
+        and alignment.corner_sigma_px < max_corner_sigma_sides * mean_side_px(alignment.corners_px)
     )
 
 
 def are_other_codewords_excluded(alignment: DrawingAlignment) -> bool:
     """True if flipping any single bit of the codeword would make the drawing fit the image clearly
     worse. How much each cell looks like the opposite colour is measured from 0 (as drawn) to 1
-    (flipped). This measure must be below `_MAX_CELL_FLIP_FRACTION`, and its standard
-    deviation below `_MAX_CELL_FLIP_FRACTION_SIGMA`, for every cell. In tests,
+    (flipped). This measure must be below `_MAX_OPPOSITE_COLOUR_LIKENESS`, and its standard
+    deviation below `_MAX_OPPOSITE_COLOUR_LIKENESS_SIGMA`, for every cell. In tests,
     `is_alignment_confirmed` wrongly accepted 36 markers with other codewords; in each of them, the
     measure was above 0.5 for at least one cell."""
     return (
-        alignment.worst_cell_flip_fraction < _MAX_CELL_FLIP_FRACTION
-        and alignment.largest_cell_flip_fraction_sigma < _MAX_CELL_FLIP_FRACTION_SIGMA
+        alignment.worst_cell_opposite_colour_likeness < _MAX_OPPOSITE_COLOUR_LIKENESS
+        and alignment.largest_opposite_colour_likeness_sigma < _MAX_OPPOSITE_COLOUR_LIKENESS_SIGMA
     )

@@ -209,8 +209,8 @@ def _make_target_outline(patterns: Mapping[MarkerName, MarkerPattern]) -> Target
     large, small = patterns["large"], patterns["small"]
     return make_outline(
         large.drawing,
-        large.cells_along_border.print_tolerance_cells,
-        small.cells_along_border.print_tolerance_cells,
+        large.cells_along_border.print_edge_sigma_cells,
+        small.cells_along_border.print_edge_sigma_cells,
     )
 
 

@@ -101,7 +101,7 @@ class DetectionPrior:
         expected_corners_both_markers_px: the predicted corners of both markers, each (4, 2) px; a
             missing marker is derived from the other one. Empty if no target is expected.
         search_mode: the kinds of search to use in this frame (`SearchMode`).
-        initial_blur_alternation_counter: number of earlier frames, since the markers were lost, in
+        blurred_fit_attempt_index: number of earlier frames, since the markers were lost, in
             which fits to blurred markers were tried at the expected position. If it is even, the
             fits in this frame start with a small blur; if it is odd, with a large one. None to try
             both.
@@ -122,7 +122,7 @@ class DetectionPrior:
     expected_corners_px: Mapping[MarkerName, Array]
     expected_corners_both_markers_px: Mapping[MarkerName, Array]
     search_mode: SearchMode
-    initial_blur_alternation_counter: int | None
+    blurred_fit_attempt_index: int | None
     was_target_seen_recently: bool
     was_target_truncated: bool
     previous_edge_shift: EdgeShift | None
@@ -162,7 +162,7 @@ class CornerMethod:
     find: Callable[[DetectorInput, DetectionPrior, CornerResults], CornerResults]
 
 
-def _is_target_expected(
+def _should_fit_edges(
     detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> bool:
     return (
@@ -183,12 +183,10 @@ def _fit_edges(
     )
 
 
-def _has_edge_fit_found_nothing(
+def _should_search_half_size_image(
     detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> bool:
-    return (
-        _is_target_expected(detector_input, prior, earlier_results) and not earlier_results.corners
-    )
+    return _should_fit_edges(detector_input, prior, earlier_results) and not earlier_results.corners
 
 
 def _search_half_size_image(
@@ -203,11 +201,11 @@ def _search_half_size_image(
     return CornerResults(corners, searched) if corners else earlier_results
 
 
-def _has_half_size_search_found_nothing(
+def _should_fit_visible_part(
     detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> bool:
     return (
-        _is_target_expected(detector_input, prior, earlier_results)
+        _should_fit_edges(detector_input, prior, earlier_results)
         and not earlier_results.search_result.corners_px
     )
 
@@ -228,7 +226,7 @@ def _needs_photometric_fit(
     detector_input: DetectorInput, prior: DetectionPrior, earlier_results: CornerResults
 ) -> bool:
     patterns = detector_input.setup.patterns
-    return _has_half_size_search_found_nothing(detector_input, prior, earlier_results) and not any(
+    return _should_fit_visible_part(detector_input, prior, earlier_results) and not any(
         is_line_fit_accurate(r, patterns[name]) for name, r in earlier_results.corners.items()
     )
 
@@ -303,7 +301,7 @@ def _run_blurred_search(
     bare = replace(detector_input, hidden_mask=None)
     if prior.expected_corners_px:
         found_corners = find_expected_blurred_marker(
-            bare, prior.expected_corners_px, prior.initial_blur_alternation_counter
+            bare, prior.expected_corners_px, prior.blurred_fit_attempt_index
         )
     else:
         found_corners = find_blurred_marker(bare)
@@ -318,7 +316,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         cost_text="0.7 ms",
         run_condition_text="the target is expected; after the target was lost, in three of four "
         "images",
-        should_run=_is_target_expected,
+        should_run=_should_fit_edges,
         find=_fit_edges,
     ),
     CornerMethod(
@@ -326,7 +324,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         requirements_text="both markers expected, those in view with sides above 60 px",
         cost_text="5 ms, including the measurement of the markers found",
         run_condition_text="the edge fit was tried and found no marker",
-        should_run=_has_edge_fit_found_nothing,
+        should_run=_should_search_half_size_image,
         find=_search_half_size_image,
     ),
     CornerMethod(
@@ -336,7 +334,7 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
         cost_text="3 ms for each marker",
         run_condition_text="the edge fit was tried, and a marker is missing; "
         "not if the half-size search found one",
-        should_run=_has_half_size_search_found_nothing,
+        should_run=_should_fit_visible_part,
         find=_fit_visible_part,
     ),
     CornerMethod(
@@ -460,9 +458,9 @@ def make_detection_prior(
     search_mode = _choose_search_mode(
         frames_without_markers, bool(expected_corners_px), setup.is_line_fit_enabled
     )
-    initial_blur_alternation_counter = None
+    blurred_fit_attempt_index = None
     if frames_without_markers is not None and search_mode in ("near_expected", "expected_fits"):
-        initial_blur_alternation_counter = (frames_without_markers + 2) // 4
+        blurred_fit_attempt_index = (frames_without_markers + 2) // 4
     # A part of the target is only recognised at a recently measured position.
     last = {} if previous is None else {d.marker: d.corners_px for d in previous.markers}
     was_recent = (
@@ -484,7 +482,7 @@ def make_detection_prior(
             expected_corners_px, setup.small_to_large_side_ratio, camera
         ),
         search_mode=search_mode,
-        initial_blur_alternation_counter=initial_blur_alternation_counter,
+        blurred_fit_attempt_index=blurred_fit_attempt_index,
         was_target_seen_recently=was_recent,
         was_target_truncated=was_recent
         and not can_complete_marker_be_in_view(last, frame.image.shape),
@@ -679,9 +677,9 @@ def add_marker_flow(current: Detections, previous: Detections | None) -> Detecti
 _MIN_CELL_FOR_ACCURATE_LINE_FIT_PX = 6.0
 # For this accuracy, a cell must also be wider than this multiple of the blur's standard deviation.
 _MIN_CELL_TO_BLUR_RATIO_FOR_ACCURATE_LINE_FIT = 6.0
-_MAX_ALIGNMENT_MOTION_SIDES = 0.3
+_MAX_PHOTOMETRIC_FIT_MOTION_FROM_START_SIDES = 0.3
 # A marker that is located from the other marker may have a larger standard deviation.
-_MAX_SINGLE_MARKER_CORNER_SIGMA_SIDES, _MAX_SECOND_MARKER_CORNER_SIGMA_SIDES = 0.06, 0.12
+_MAX_SINGLE_MARKER_CORNER_SIGMA_SIDES, _MAX_CORNER_SIGMA_IF_OTHER_MARKER_FOUND_SIDES = 0.06, 0.12
 _DEFAULT_INITIAL_BLUR_SIGMA_PX = 1.5
 _SAMPLING_BLUR_SIGMA_PX = 0.37
 """Standard deviation, px, that pixels and interpolation add to the measured blur of a marker's
@@ -731,14 +729,14 @@ def refine_photometrically(
         max_corner_sigma_sides = (
             _MAX_SINGLE_MARKER_CORNER_SIGMA_SIDES
             if is_single
-            else _MAX_SECOND_MARKER_CORNER_SIGMA_SIDES
+            else _MAX_CORNER_SIGMA_IF_OTHER_MARKER_FOUND_SIDES
         )
         blur_px = _photometric_initial_blur_sigma_px(better.get(name))
         exact = align_marker(
             detector_input,
             name,
             start,
-            _MAX_ALIGNMENT_MOTION_SIDES,
+            _MAX_PHOTOMETRIC_FIT_MOTION_FROM_START_SIDES,
             blur_px,
             max_corner_sigma_sides,
             is_single,
@@ -790,7 +788,7 @@ def _photometric_start_corners_px(
 
 
 _MIN_CELL_FOR_LINE_FIT_PX = 2.5
-_MAX_LARGE_TO_SMALL_OFFSET_SMALL_SIDES = 0.12
+_MAX_DERIVED_SMALL_MARKER_CORNER_ERROR_SIDES = 0.12
 
 
 def fit_side_lines(
@@ -907,7 +905,7 @@ def find_large_marker_around_small(
         centre = detector_input.derive_corners_from_other_marker_px(large.corners_px, "small")
         off_px = float(np.abs(centre - small.corners_px).max())
         return off_px <= max(
-            _MAX_LARGE_TO_SMALL_OFFSET_SMALL_SIDES * mean_side_px(small.corners_px), 1.0
+            _MAX_DERIVED_SMALL_MARKER_CORNER_ERROR_SIDES * mean_side_px(small.corners_px), 1.0
         )
 
     if is_inside_image(start, image.shape, IMAGE_BORDER_MARGIN_PX):

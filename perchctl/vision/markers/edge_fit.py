@@ -347,7 +347,7 @@ def _refine_corners_by_lines_once(
                 blur_px,
                 sum(ends) / 4.0,
                 bool(is_white_clipped[i]),
-                rim.print_tolerance_cells,
+                rim.print_edge_sigma_cells,
             ),
             are_corners_fitted=True,
             remaining_edge_shift_sigma_px=applied.sigma_px,
@@ -486,7 +486,7 @@ def _measure_edge_shift(
     variance = max(chi2, 1.0) / total
     # Errors that averaging does not reduce: the neighbours' blur and the print.
     variance += (2.0 * math.exp(-cell_size_px / 2.2)) ** 2 + (
-        rim.print_tolerance_cells * cell_size_px
+        rim.print_edge_sigma_cells * cell_size_px
     ) ** 2
     prior = prior_px**2
     return EdgeShift(
@@ -801,19 +801,19 @@ def find_neighbour_edges(
     is_edge_locatable_per_profile = np.ones(fractions_along_side.shape, np.bool_)
     for i, rim in enumerate(cells_along_border):
         four = slice(4 * i, 4 * i + 4)
-        has_inner_neighbour_f32[four] = rim.is_first_inner_cell_white[
+        has_inner_neighbour_f32[four] = rim.is_cell_next_to_border_white[
             _SIDE_INDICES, (fractions_along_side[four] * rim.cells_per_side).astype(np.intp)
         ]
     if len(fractions_along_side) > 4 * len(cells_along_border):
         # Position of each profile, in cells from the border's corner.
         at = 1.0 + fractions_along_side[-4:] * (cells_along_inner_edges.cells_per_side - 2)
         # Blur bends the edge if the nearest inner cell, or the cell behind it, is black.
-        free = cells_along_inner_edges.are_first_two_inner_cells_white[
+        free = cells_along_inner_edges.are_two_cells_next_to_border_white[
             _SIDE_INDICES, (at - 0.3).astype(np.intp)
         ]
         free = (
             free
-            * cells_along_inner_edges.are_first_two_inner_cells_white[
+            * cells_along_inner_edges.are_two_cells_next_to_border_white[
                 _SIDE_INDICES, (at + 0.3).astype(np.intp)
             ]
         )

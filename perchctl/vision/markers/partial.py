@@ -66,7 +66,7 @@ from perchctl.vision.markers.edge_fit import (
     window_and_profile_half_lengths_px,
 )
 from perchctl.vision.markers.pattern import (
-    MIN_CELL_MARGIN_TO_CONTRAST_RATIO,
+    MIN_CELL_GREY_MARGIN_TO_CONTRAST_RATIO,
     MIN_CONTRAST_GREY,
     MIN_MATCHING_CELL_FRACTION,
     MarkerPattern,
@@ -81,7 +81,7 @@ _MAX_BLUR_TO_WINDOW_HALF_LENGTH_RATIO = 0.9
 _MAX_CORNER_SIGMA_SIDES = 0.02  # Corners with a larger standard deviation are rejected.
 _MIN_EDGE_SHIFT_SIGMA_PX = 0.01
 # Robust weights make the squared residuals smaller; this factor compensates for that.
-_ROBUST_VARIANCE_FACTOR = 1.3
+_ROBUST_WEIGHT_VARIANCE_CORRECTION = 1.3
 _MAX_HOMOGRAPHY_INCREMENT = 0.5
 # Three times the reach of a search window; the edges cannot move a fit further from its start.
 _MAX_MOTION_FROM_START_PX = 20.0
@@ -174,7 +174,10 @@ def _make_edge_normal_equations(
     respect to x, and the normal matrix N (9, 9) and the right-hand side g (9,) of the normal
     equations N x = g. The covariance of x is the inverse of N times the variance of an edge, px^2.
     """
-    u, v = visible_edges.points_half_sides[..., 0], visible_edges.points_half_sides[..., 1]
+    u, v = (
+        visible_edges.measured_points_half_sides[..., 0],
+        visible_edges.measured_points_half_sides[..., 1],
+    )
     nx, ny = (
         SIDE_OUTWARD_NORMALS[visible_edges.side_index].T[..., None]
         * visible_edges.px_per_half_side[:, None]
@@ -185,17 +188,17 @@ def _make_edge_normal_equations(
     across = A[0] + A[4]
     A[6], A[7] = -u * across, -v * across
     # The increment moves the edge of the model, whereas the shift moves the observed edge.
-    A[8] = np.where(visible_edges.edge_to_centre_half_sides < 1.0, 1.0, -1.0)[:, None]
+    A[8] = np.where(visible_edges.edge_distance_from_centre_half_sides < 1.0, 1.0, -1.0)[:, None]
     A = A.reshape(9, -1)
     # Profiles that are less than a pixel apart measure the same part of the edge.
     worth = np.minimum(
         1.0,
         2.0
         * visible_edges.px_per_half_side
-        * visible_edges.edge_to_centre_half_sides
+        * visible_edges.edge_distance_from_centre_half_sides
         / PROFILES_PER_SIDE,
     )
-    weighted = A * (visible_edges.weight * worth[:, None]).ravel()
+    weighted = A * (visible_edges.profile_weight * worth[:, None]).ravel()
     N, g = weighted.dot(A.T), weighted.dot(visible_edges.outward_edge_offset_px.ravel())
     # The standard deviation of an edge is not known yet, so it is assumed to be a tenth of a pixel.
     certain = (0.1 / edge_shift_prior.sigma_px) ** 2
@@ -229,7 +232,7 @@ def _make_refined_corners(
         pattern: the marker's pattern.
         camera: camera model, including lens distortion.
     """
-    w = visible_edges.weight
+    w = visible_edges.profile_weight
     mass = w.sum(axis=1)
     used = mass > 0.0
     if (
@@ -246,7 +249,10 @@ def _make_refined_corners(
     scatter = float((w * (residual_px - mean[:, None]) ** 2).sum() / w.sum())
     chi2 = float((mean**2 * mass).sum()) / max(scatter, MIN_LINE_SIGMA_PX**2)
     freedom = max(2.0 * np.count_nonzero(used) - 9.0, 1.0)
-    noise2 = max(_ROBUST_VARIANCE_FACTOR * scatter * max(chi2 / freedom, 1.0), MIN_LINE_SIGMA_PX**2)
+    noise2 = max(
+        _ROBUST_WEIGHT_VARIANCE_CORRECTION * scatter * max(chi2 / freedom, 1.0),
+        MIN_LINE_SIGMA_PX**2,
+    )
     pinhole = apply_homography(H_pinhole_marker, CENTRED_SQUARE)
     corners_px = distort_to_px(
         apply_homography(np.asarray(np.linalg.inv(camera.K)), pinhole), camera
@@ -259,7 +265,7 @@ def _make_refined_corners(
     cov_px2: Array = J @ np.linalg.inv(normal_matrix[:8, :8]) @ J.T * noise2
     floor2 = (
         MIN_LINE_SIGMA_PX**2
-        + (pattern.cells_along_border.print_tolerance_cells * cell_size_px) ** 2
+        + (pattern.cells_along_border.print_edge_sigma_cells * cell_size_px) ** 2
     )
     cov_px2 = cov_px2 + np.eye(8) * (floor2 + 0.25 * np.exp(cell_size_px * (-2.0 / 1.8)))
     vaguest_px = math.sqrt(float(np.diagonal(cov_px2).max()))
@@ -331,7 +337,7 @@ def _has_matching_visible_cells(
     )
     is_cell_visible = _is_cell_visible(is_sample_visible, pattern)
     share = (means - 0.5 * (high + low)) / contrast * np.where(pattern.is_cell_white, 1.0, -1.0)
-    wrong = np.count_nonzero(is_cell_visible & (share < MIN_CELL_MARGIN_TO_CONTRAST_RATIO))
+    wrong = np.count_nonzero(is_cell_visible & (share < MIN_CELL_GREY_MARGIN_TO_CONTRAST_RATIO))
     most_wrong = 0
     if identified_by == "other_marker":
         most_wrong = math.floor(
@@ -412,7 +418,10 @@ IMAGE_BORDER_MARGIN_PX = 2.0
 _MIN_CELL_TO_MEASURE_INNER_EDGE_PX = 6.0
 # A clean profile deviates from black on its dark side, and from white on its bright side, by less
 # than these fractions of the contrast.
-_MAX_DARK_DEVIATION_TO_CONTRAST_RATIO, _MAX_BRIGHT_DEVIATION_TO_CONTRAST_RATIO = 0.2, 0.5
+(
+    _MAX_DARK_SIDE_GREY_DEVIATION_TO_CONTRAST_RATIO,
+    _MAX_BRIGHT_SIDE_GREY_DEVIATION_TO_CONTRAST_RATIO,
+) = 0.2, 0.5
 _MIN_PARTIAL_MARKER_CONTRAST_GREY = 10.0
 _MIN_PROFILE_WEIGHT_SUM_PER_SIDE = 3.0
 _MIN_VISIBLE_EDGES = 4  # A square has eight unknowns, and an edge determines two of them.
@@ -429,14 +438,14 @@ class VisibleEdges:
     along which the image is sampled.
 
     Attributes:
-        points_half_sides: measured point of the edge on each profile (m, n, 2), in half
+        measured_points_half_sides: measured point of the edge on each profile (m, n, 2), in half
             sides from the marker's centre.
         outward_edge_offset_px: distance (m, n) of each measured point from the edge as predicted by
             the current homography, positive away from the marker's centre.
-        weight: weight (m, n) of each profile in the fit, 0 if it is not used.
+        profile_weight: weight (m, n) of each profile in the fit, 0 if it is not used.
         side_index: index (m,) of the side to which the edge is parallel and adjacent, 0 to 3. Side
             k runs from corner k to corner k + 1.
-        edge_to_centre_half_sides: distance (m,) of the edge from the marker's centre: 1
+        edge_distance_from_centre_half_sides: distance (m,) of the edge from the marker's centre: 1
             for a side, less for an inner edge of the border.
         px_per_half_side: scale (m,) of the image across the edge.
         blur_sigma_to_window_half_length_ratio: standard deviation of the edge's blur divided by
@@ -444,11 +453,11 @@ class VisibleEdges:
         white_grey: grey level of white paper.
     """
 
-    points_half_sides: Array
+    measured_points_half_sides: Array
     outward_edge_offset_px: Array
-    weight: Array
+    profile_weight: Array
     side_index: NDArray[np.intp]
-    edge_to_centre_half_sides: Array
+    edge_distance_from_centre_half_sides: Array
     px_per_half_side: Array
     blur_sigma_to_window_half_length_ratio: Array
     white_grey: float
@@ -534,11 +543,11 @@ def find_visible_edges(
         return None
     far = np.einsum("rni,ri->rn", own, SIDE_OUTWARD_NORMALS[side]) - at[:, None]
     return VisibleEdges(
-        points_half_sides=own,
+        measured_points_half_sides=own,
         outward_edge_offset_px=far * scale_px[:, None],
-        weight=weight,
+        profile_weight=weight,
         side_index=side,
-        edge_to_centre_half_sides=at,
+        edge_distance_from_centre_half_sides=at,
         px_per_half_side=scale_px,
         blur_sigma_to_window_half_length_ratio=blur_px / window_half_length_px,
         white_grey=white,
@@ -612,7 +621,7 @@ def _find_clean_edge_profiles(
     contrast = white - black
     if contrast < _MIN_PARTIAL_MARKER_CONTRAST_GREY:
         return None
-    good = (dark < black + _MAX_DARK_DEVIATION_TO_CONTRAST_RATIO * contrast) & (
-        bright > white - _MAX_BRIGHT_DEVIATION_TO_CONTRAST_RATIO * contrast
+    good = (dark < black + _MAX_DARK_SIDE_GREY_DEVIATION_TO_CONTRAST_RATIO * contrast) & (
+        bright > white - _MAX_BRIGHT_SIDE_GREY_DEVIATION_TO_CONTRAST_RATIO * contrast
     )
     return is_unobstructed & good, white

@@ -21,13 +21,13 @@ from perchctl.vision.markers.corners import (
 MIN_MARKER_SIDE_PX = 7.0  # A smaller marker looks like a blob.
 MIN_CONTRAST_GREY = 10.0
 # A cell must differ from the threshold by at least this fraction of the contrast.
-MIN_CELL_MARGIN_TO_CONTRAST_RATIO = 0.1
+MIN_CELL_GREY_MARGIN_TO_CONTRAST_RATIO = 0.1
 MIN_MATCHING_CELL_FRACTION = 0.8
 """Fraction of the cells that must have the right colour."""
 _MIN_PATTERN_CORRELATION = 0.6
 # Within this distance from the centre, in half sides of the small marker, no cells are sampled,
 # because the small marker may hide them.
-_SMALL_MARKER_EXCLUSION_REACH_HALF_SIDES = 1.25
+_UNSAMPLED_CENTRE_TO_SMALL_MARKER_SIDE_RATIO = 1.25
 _SAMPLE_OFFSETS_CELLS: Array = np.array(
     [[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0.22]]
 )
@@ -40,20 +40,20 @@ class CellsAlongBorder:
     at both ends, which count as black.
 
     Attributes:
-        is_first_inner_cell_white: 1.0 if the cell next to the border is white, 0.0 if it is
+        is_cell_next_to_border_white: 1.0 if the cell next to the border is white, 0.0 if it is
             black, at each position along each side (4, n).
-        are_first_two_inner_cells_white: 1.0 if that cell and the next one towards the marker's
+        are_two_cells_next_to_border_white: 1.0 if that cell and the next one towards the marker's
             centre are both white, otherwise 0.0 (4, n).
-        print_tolerance_cells: standard deviation of a printed edge's position, in cells.
+        print_edge_sigma_cells: standard deviation of a printed edge's position, in cells.
     """
 
-    is_first_inner_cell_white: Array
-    are_first_two_inner_cells_white: Array
-    print_tolerance_cells: float = 0.0
+    is_cell_next_to_border_white: Array
+    are_two_cells_next_to_border_white: Array
+    print_edge_sigma_cells: float = 0.0
 
     @property
     def cells_per_side(self) -> int:
-        return int(self.is_first_inner_cell_white.shape[1])
+        return int(self.is_cell_next_to_border_white.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,10 +86,10 @@ class MarkerPattern:
 
 
 def make_cells_along_border(
-    bits: NDArray[np.uint8], print_tolerance_cells: float = 0.0
+    bits: NDArray[np.uint8], print_edge_sigma_cells: float = 0.0
 ) -> CellsAlongBorder:
     """Return the cells inside the border of a marker with inner bits (n, n), 1 = white: the cells
-    whose blur may reach the edges of the border. `print_tolerance_cells` is the standard deviation
+    whose blur may reach the edges of the border. `print_edge_sigma_cells` is the standard deviation
     of a printed edge's position, in cells."""
     n = len(bits)
 
@@ -103,7 +103,7 @@ def make_cells_along_border(
 
     white = np.pad(ring(0), ((0, 0), (1, 1)))
     second = np.pad(ring(1), ((0, 0), (1, 1)))
-    return CellsAlongBorder(white, white * second, print_tolerance_cells)
+    return CellsAlongBorder(white, white * second, print_edge_sigma_cells)
 
 
 def make_marker_pattern(
@@ -121,7 +121,7 @@ def make_marker_pattern(
     owner = np.repeat(np.arange(n * n), len(_SAMPLE_OFFSETS_CELLS))
     free = (
         np.abs(sample_points_half_sides).max(axis=1)
-        > _SMALL_MARKER_EXCLUSION_REACH_HALF_SIDES * drawing.small_to_large_side_ratio
+        > _UNSAMPLED_CENTRE_TO_SMALL_MARKER_SIDE_RATIO * drawing.small_to_large_side_ratio
     )
     kept = np.unique(owner[free])
     turns, at = [], sample_points_half_sides[free]
@@ -146,7 +146,7 @@ def make_marker_pattern(
 def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern) -> bool:
     """True if every cell of a marker with corners (4, 2) px in the image clearly has the colour of
     its cell in the pattern: its mean grey is on the right side of the middle between the medians of
-    black and white, by at least `MIN_CELL_MARGIN_TO_CONTRAST_RATIO` of the contrast. False if
+    black and white, by at least `MIN_CELL_GREY_MARGIN_TO_CONTRAST_RATIO` of the contrast. False if
     the contrast is below `MIN_CONTRAST_GREY` or the marker is partly outside the image."""
     means = _mean_grey_per_cell(image, corners_px, pattern)
     if means is None:
@@ -156,7 +156,7 @@ def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: Mar
     high = float(np.partition(white, len(white) // 2)[len(white) // 2])
     low = float(np.partition(black, len(black) // 2)[len(black) // 2])
     contrast = high - low
-    middle, margin = 0.5 * (high + low), MIN_CELL_MARGIN_TO_CONTRAST_RATIO * contrast
+    middle, margin = 0.5 * (high + low), MIN_CELL_GREY_MARGIN_TO_CONTRAST_RATIO * contrast
     return bool(
         contrast >= MIN_CONTRAST_GREY
         and white.min() > middle + margin
@@ -267,20 +267,20 @@ class MarkerDrawing:
             there is none.
         small_to_large_side_ratio: side of the small marker divided by the side of this marker; 0 if
             there is no small marker.
-        white_ring_reach_half_sides: distance from the centre to the outer edge of the
+        white_ring_outer_half_width_half_sides: distance from the centre to the outer edge of the
             white ring. This marker's own cells are not printed any closer to the centre.
-        paper_reach_half_sides: distance from the centre to the edge of the square paper; None
+        paper_half_width_half_sides: distance from the centre to the edge of the square paper; None
             if the paper is assumed to be infinite.
     """
 
     cell_whiteness: Array
     small_marker_cell_whiteness: Array | None = None
     small_to_large_side_ratio: float = 0.0
-    white_ring_reach_half_sides: float = 0.0
-    paper_reach_half_sides: float | None = None
+    white_ring_outer_half_width_half_sides: float = 0.0
+    paper_half_width_half_sides: float | None = None
 
     @property
-    def photometric_fit_reach_half_sides(self) -> float:
+    def photometric_fit_half_width_half_sides(self) -> float:
         """Half the side, in half sides of the marker, of the square that the photometric fit
         compares with the image."""
         return 1.0 + _FITTED_WHITE_MARGIN_CELLS * 2.0 / len(self.cell_whiteness)
@@ -290,7 +290,7 @@ def make_marker_drawing(
     bits: NDArray[np.uint8],
     small_marker_bits: NDArray[np.uint8] | None = None,
     small_to_large_side_ratio: float = 0.0,
-    white_ring_reach_half_sides: float = 0.0,
+    white_ring_outer_half_width_half_sides: float = 0.0,
 ) -> MarkerDrawing:
     """Return the drawing of a marker with inner bits `bits` (n, n), 1 = white, to which a black
     border is added.
@@ -299,7 +299,7 @@ def make_marker_drawing(
 
     - `small_marker_bits` (m, m): its inner bits, 1 = white.
     - `small_to_large_side_ratio`: its side divided by the side of the large marker.
-    - `white_ring_reach_half_sides`: the distance from the centre to the outer edge of
+    - `white_ring_outer_half_width_half_sides`: the distance from the centre to the outer edge of
       the white ring around it, in half sides of the large marker; if it is less than the half side
       of the small marker, that half side is used.
 
@@ -313,38 +313,42 @@ def make_marker_drawing(
         cells,
         np.pad(small_marker_bits.astype(np.float64), 1),
         small_to_large_side_ratio,
-        max(white_ring_reach_half_sides, small_to_large_side_ratio),
+        max(white_ring_outer_half_width_half_sides, small_to_large_side_ratio),
         1.0 + 2.0 / len(cells),
     )
 
 
 def _cell_coverage(
     node_positions_half_sides: Array,
-    node_reach_half_sides: float,
+    node_half_width_half_sides: float,
     cells_per_side: int,
-    square_reach_half_sides: float,
-    max_counted_reach_half_sides: float = math.inf,
+    square_half_width_half_sides: float,
+    max_counted_distance_from_centre_half_sides: float = math.inf,
 ) -> Array:
     """Return the fraction of each node's interval that each cell covers, (nodes, cells), along one
-    axis. A node's interval extends `node_reach_half_sides` to each side of its position. The
-    `cells_per_side` cells fill the interval from -square_reach_half_sides to
-    square_reach_half_sides; of each cell, only the part up to
-    `max_counted_reach_half_sides` from the centre counts. Lengths are in half sides
+    axis. A node's interval extends `node_half_width_half_sides` to each side of its position. The
+    `cells_per_side` cells fill the interval from -square_half_width_half_sides to
+    square_half_width_half_sides; of each cell, only the part up to
+    `max_counted_distance_from_centre_half_sides` from the centre counts. Lengths are in half sides
     from the marker's centre."""
-    edges = square_reach_half_sides * np.linspace(-1.0, 1.0, cells_per_side + 1)
-    edges = np.clip(edges, -max_counted_reach_half_sides, max_counted_reach_half_sides)
+    edges = square_half_width_half_sides * np.linspace(-1.0, 1.0, cells_per_side + 1)
+    edges = np.clip(
+        edges,
+        -max_counted_distance_from_centre_half_sides,
+        max_counted_distance_from_centre_half_sides,
+    )
     low, high = (
-        node_positions_half_sides[:, None] - node_reach_half_sides,
-        node_positions_half_sides[:, None] + node_reach_half_sides,
+        node_positions_half_sides[:, None] - node_half_width_half_sides,
+        node_positions_half_sides[:, None] + node_half_width_half_sides,
     )
     overlap = np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1])
-    return np.asarray(np.maximum(overlap, 0.0) / (2.0 * node_reach_half_sides))
+    return np.asarray(np.maximum(overlap, 0.0) / (2.0 * node_half_width_half_sides))
 
 
-def _add_margin_nodes(node_positions_half_sides: Array, node_reach_half_sides: float) -> Array:
+def _add_margin_nodes(node_positions_half_sides: Array, node_half_width_half_sides: float) -> Array:
     """Return the node positions along one axis after adding `BLUR_MARGIN_NODES` nodes at both ends.
-    `node_reach_half_sides` is half the spacing of the nodes."""
-    more = 2.0 * node_reach_half_sides * np.arange(1, BLUR_MARGIN_NODES + 1)
+    `node_half_width_half_sides` is half the spacing of the nodes."""
+    more = 2.0 * node_half_width_half_sides * np.arange(1, BLUR_MARGIN_NODES + 1)
     return np.concatenate(
         [
             node_positions_half_sides[0] - more[::-1],
@@ -363,21 +367,21 @@ def render_whiteness_and_off_paper_fraction(
     blur.
 
     The first array returned is the whiteness of each node, 0 to 1. If the drawing has a
-    `paper_reach_half_sides`, a second array contains the fraction of each node that is beyond
+    `paper_half_width_half_sides`, a second array contains the fraction of each node that is beyond
     the paper.
     """
-    node_reach_half_sides = drawing.photometric_fit_reach_half_sides / nodes_per_side
-    node_positions_half_sides: Array = node_reach_half_sides * (
+    node_half_width_half_sides = drawing.photometric_fit_half_width_half_sides / nodes_per_side
+    node_positions_half_sides: Array = node_half_width_half_sides * (
         2.0 * np.arange(nodes_per_side, dtype=np.float64) + 1.0 - nodes_per_side
     )
-    paper = render_cells(drawing, node_positions_half_sides, node_reach_half_sides)
-    if drawing.paper_reach_half_sides is None:
+    paper = render_cells(drawing, node_positions_half_sides, node_half_width_half_sides)
+    if drawing.paper_half_width_half_sides is None:
         return (paper,)
     on = _cell_coverage(
-        _add_margin_nodes(node_positions_half_sides, node_reach_half_sides),
-        node_reach_half_sides,
+        _add_margin_nodes(node_positions_half_sides, node_half_width_half_sides),
+        node_half_width_half_sides,
         1,
-        drawing.paper_reach_half_sides,
+        drawing.paper_half_width_half_sides,
     )
     return paper, (1.0 - on @ on.T).astype(np.float32)
 
@@ -395,30 +399,30 @@ def render_black_square(cells_per_side: int, nodes_per_side: int) -> NDArray[np.
 
 
 def render_cells(
-    drawing: MarkerDrawing, node_positions_half_sides: Array, node_reach_half_sides: float
+    drawing: MarkerDrawing, node_positions_half_sides: Array, node_half_width_half_sides: float
 ) -> NDArray[np.float32]:
     """Return the whiteness of the drawing, 0 to 1, at the nodes of a square grid, without blur. The
     nodes are at `node_positions_half_sides` (n,) along both axes, in half sides from the marker's
     centre, and the result also has a margin of m = `BLUR_MARGIN_NODES` nodes on all sides: (n + 2m,
     n + 2m). Each value is the mean over the node's square, which extends
-    `node_reach_half_sides`, half the spacing, to each side. The surroundings of the marker are
+    `node_half_width_half_sides`, half the spacing, to each side. The surroundings of the marker are
     white."""
-    wide = _add_margin_nodes(node_positions_half_sides, node_reach_half_sides)
-    C = _cell_coverage(wide, node_reach_half_sides, len(drawing.cell_whiteness), 1.0)
+    wide = _add_margin_nodes(node_positions_half_sides, node_half_width_half_sides)
+    C = _cell_coverage(wide, node_half_width_half_sides, len(drawing.cell_whiteness), 1.0)
     black = C @ (1.0 - drawing.cell_whiteness) @ C.T
     if drawing.small_marker_cell_whiteness is not None:
         # The part of the large marker that the small one and its ring replace.
         C = _cell_coverage(
             wide,
-            node_reach_half_sides,
+            node_half_width_half_sides,
             len(drawing.cell_whiteness),
             1.0,
-            drawing.white_ring_reach_half_sides,
+            drawing.white_ring_outer_half_width_half_sides,
         )
         black -= C @ (1.0 - drawing.cell_whiteness) @ C.T
         C = _cell_coverage(
             wide,
-            node_reach_half_sides,
+            node_half_width_half_sides,
             len(drawing.small_marker_cell_whiteness),
             drawing.small_to_large_side_ratio,
         )
@@ -429,16 +433,16 @@ def render_cells(
 def blurred_cell_coverage(
     drawing: MarkerDrawing,
     node_positions_half_sides: Array,
-    node_reach_half_sides: float,
+    node_half_width_half_sides: float,
     blur_sigma_nodes: float,
 ) -> Array:
     """Return the fraction (n, cells) of each node's interval that each row of the drawing's cells
     covers, along one axis, after a Gaussian blur with the standard deviation `blur_sigma_nodes`, in
     node spacings. The nodes are at `node_positions_half_sides` (n,), in half sides from the
-    marker's centre; their intervals extend `node_reach_half_sides` to each side."""
+    marker's centre; their intervals extend `node_half_width_half_sides` to each side."""
     wide = _cell_coverage(
-        _add_margin_nodes(node_positions_half_sides, node_reach_half_sides),
-        node_reach_half_sides,
+        _add_margin_nodes(node_positions_half_sides, node_half_width_half_sides),
+        node_half_width_half_sides,
         len(drawing.cell_whiteness),
         1.0,
     )

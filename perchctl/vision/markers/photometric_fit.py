@@ -13,7 +13,7 @@ the drawing after the fit, the image does not show the marker.
 The result is wrong if the blur is anisotropic (fast motion), if something covers a part of the
 marker but leaves the cells readable, or if white is clipped. The fit itself does not notice if
 another codeword looks the same after this blur;
-`DrawingAlignment.worst_cell_flip_fraction` is a measure of how close another codeword
+`DrawingAlignment.worst_cell_opposite_colour_likeness` is a measure of how close another codeword
 is.
 
 The coordinates u are the marker's own (see `perchctl.vision.markers.corners`). Grey values are 0 to
@@ -51,7 +51,7 @@ from perchctl.vision.markers.pattern import (
 )
 from perchctl.vision.types import CameraModel
 
-_MAX_GRID_NODES, _MIN_GRID_NODES = 44, 18
+_MAX_GRID_NODES_PER_SIDE, _MIN_GRID_NODES_PER_SIDE = 44, 18
 _NODE_SPACING_PX = 0.8
 _MAX_ITERATIONS = 12
 _EARLY_CHECK_ITERATIONS, _MIN_EARLY_CORRELATION = 4, 0.7
@@ -100,32 +100,32 @@ class DrawingAlignment:
 
     Attributes:
         corners_px: the marker's corners (4, 2) in the distorted image.
-        sigma_px: standard deviation of the corners.
+        corner_sigma_px: standard deviation of the corners.
         fit_correlation: correlation, 0 to 1, of the image's grey values with those of the whole
             fitted drawing.
-        pattern_correlation: correlation, -1 to 1, of the image with the inner pattern alone:
+        inner_pattern_correlation: correlation, -1 to 1, of the image with the inner pattern alone:
             the best-fitting plain black square is first subtracted from both the image and the
             drawing.
         pattern_to_border_contrast_ratio: contrast of the inner pattern in the image, divided by the
             contrast between black and white of the whole fitted drawing.
         largest_cell_grey_deviation_to_contrast_ratio: largest deviation of a cell's mean grey from
             its mean grey in the fitted drawing, relative to the contrast of black and white.
-        worst_cell_flip_fraction: how much the worst cell looks like the opposite colour,
+        worst_cell_opposite_colour_likeness: how much the worst cell looks like the opposite colour,
             from 0 (as drawn) to 1 (flipped bit).
-        largest_cell_flip_fraction_sigma: standard deviation of this measure for the cell in
+        largest_opposite_colour_likeness_sigma: standard deviation of this measure for the cell in
             which it is least certain.
         blur_sigma_px: standard deviation of the fitted blur.
         largest_motion_from_start_px: largest distance of a fitted corner from its start.
     """
 
     corners_px: Array
-    sigma_px: float
+    corner_sigma_px: float
     fit_correlation: float
-    pattern_correlation: float
+    inner_pattern_correlation: float
     pattern_to_border_contrast_ratio: float
     largest_cell_grey_deviation_to_contrast_ratio: float
-    worst_cell_flip_fraction: float
-    largest_cell_flip_fraction_sigma: float
+    worst_cell_opposite_colour_likeness: float
+    largest_opposite_colour_likeness_sigma: float
     blur_sigma_px: float
     largest_motion_from_start_px: float
 
@@ -172,11 +172,15 @@ def align_drawing(
     if not np.isfinite(start).all():
         return None
     sides = np.hypot(*(start - np.roll(start, 1, axis=0)).T)
-    side_px, reach = float(sides.mean()), drawing.photometric_fit_reach_half_sides
+    side_px, reach = float(sides.mean()), drawing.photometric_fit_half_width_half_sides
     if float(sides.min()) < _MIN_SIDE_PX or side_px > _MAX_SIDE_PX:
         return None
     n = int(
-        np.clip(math.ceil(reach * side_px / _NODE_SPACING_PX), _MIN_GRID_NODES, _MAX_GRID_NODES)
+        np.clip(
+            math.ceil(reach * side_px / _NODE_SPACING_PX),
+            _MIN_GRID_NODES_PER_SIDE,
+            _MAX_GRID_NODES_PER_SIDE,
+        )
     )
     node_px, cell_size_px = reach * side_px / n, side_px / len(drawing.cell_whiteness)
     grid, H_pinhole_marker = make_sampling_grid(n, reach), homography_from_centred_square(start)
@@ -242,15 +246,17 @@ def align_drawing(
     # These are the residuals of the last iteration, whose step was negligible.
     contrast_grey, grey_residual = equations.contrast_grey, equations.grey_residual
     corners_px = distort_px(apply_homography(H_pinhole_marker, CENTRED_SQUARE).T, camera).T
-    pattern_correlation, pattern_to_border_contrast_ratio = _measure_inner_pattern_match(
+    inner_pattern_correlation, pattern_to_border_contrast_ratio = _measure_inner_pattern_match(
         rendered_drawing, grey, contrast_grey
     )
     nodes_per_independent_sample = _estimate_nodes_per_independent_sample(
         grey_residual.reshape(n, n)
     )
     inverse_normal_matrix = np.asarray(np.linalg.inv(equations.normal_matrix))
-    worst_cell_flip_fraction, largest_cell_flip_fraction_sigma = _measure_worst_cell_flip_fraction(
-        rendered_drawing, equations, inverse_normal_matrix, nodes_per_independent_sample
+    worst_cell_opposite_colour_likeness, largest_opposite_colour_likeness_sigma = (
+        _measure_opposite_colour_likeness(
+            rendered_drawing, equations, inverse_normal_matrix, nodes_per_independent_sample
+        )
     )
     J = corners_jacobian_wrt_homography_increment(H_pinhole_marker)
     variance = (
@@ -268,15 +274,15 @@ def align_drawing(
     )
     return DrawingAlignment(
         corners_px=corners_px,
-        sigma_px=math.sqrt(max(variance, 0.0)),
+        corner_sigma_px=math.sqrt(max(variance, 0.0)),
         fit_correlation=correlation_from_residual(grey, grey_residual),
-        pattern_correlation=pattern_correlation,
+        inner_pattern_correlation=inner_pattern_correlation,
         pattern_to_border_contrast_ratio=pattern_to_border_contrast_ratio,
         largest_cell_grey_deviation_to_contrast_ratio=_largest_cell_grey_deviation(
             grey_residual / contrast_grey, grid, len(drawing.cell_whiteness)
         ),
-        worst_cell_flip_fraction=worst_cell_flip_fraction,
-        largest_cell_flip_fraction_sigma=largest_cell_flip_fraction_sigma,
+        worst_cell_opposite_colour_likeness=worst_cell_opposite_colour_likeness,
+        largest_opposite_colour_likeness_sigma=largest_opposite_colour_likeness_sigma,
         blur_sigma_px=rendered_drawing.blur_sigma_nodes * node_px,
         largest_motion_from_start_px=float(np.abs(corners_px - start_corners_px).max()),
     )
@@ -292,11 +298,11 @@ def _make_normal_equations(
     towards zero."""
     rows, products = rendered_drawing.illumination_basis
     A = products + 1e-6 * np.eye(len(products))
-    A[TONE_CURVE_BEND, TONE_CURVE_BEND] += 1e-3 * len(
+    A[TONE_CURVE_BEND_INDEX, TONE_CURVE_BEND_INDEX] += 1e-3 * len(
         grey
     )  # keeps the bend at zero unless it is visible
     illumination = np.asarray(np.linalg.solve(A, np.einsum("kn,n->k", rows, grey)))
-    contrast_grey = float(illumination[GAIN])
+    contrast_grey = float(illumination[GAIN_INDEX])
     if contrast_grey < _MIN_FITTED_CONTRAST_GREY:
         return None
     grey_residual = grey - np.einsum("kn,k->n", rows, illumination)
@@ -310,11 +316,11 @@ def _make_normal_equations(
     noise = max(float((grey_residual**2).mean()), 1.0)
     products = gram_matrix(J) / noise
     J, N, g = J[:-1], products[:-1, :-1], products[:-1, -1]
-    bend = _FIRST_ILLUMINATION_INDEX + TONE_CURVE_BEND
+    bend = _FIRST_ILLUMINATION_INDEX + TONE_CURVE_BEND_INDEX
     N[_BLUR_VARIANCE_INDEX, _BLUR_VARIANCE_INDEX] += 1.0  # limits the step to about a node's width
     N[bend, bend] += (_TONE_CURVE_BEND_PRIOR_SIGMA * contrast_grey) ** -2.0
     g[bend] -= (
-        illumination[TONE_CURVE_BEND] * (_TONE_CURVE_BEND_PRIOR_SIGMA * contrast_grey) ** -2.0
+        illumination[TONE_CURVE_BEND_INDEX] * (_TONE_CURVE_BEND_PRIOR_SIGMA * contrast_grey) ** -2.0
     )
     N[range(_FIRST_ILLUMINATION_INDEX, len(g)), range(_FIRST_ILLUMINATION_INDEX, len(g))] += 1e-6
     N[range(8), range(8)] += _HOMOGRAPHY_INCREMENT_PRIOR_INFORMATION
@@ -336,7 +342,7 @@ def correlation_from_residual(grey: Array, grey_residual: Array) -> float:
     return math.sqrt(max(explained, 0.0))
 
 
-def _measure_worst_cell_flip_fraction(
+def _measure_opposite_colour_likeness(
     rendered_drawing: RenderedDrawing,
     equations: _NormalEquations,
     inverse_normal_matrix: Array,
@@ -378,7 +384,7 @@ def _measure_inner_pattern_match(
     white. Both are 0 if nothing remains."""
     rows, products = drawing.black_square_illumination_basis
     A = products + 1e-9 * np.eye(len(products))
-    both = drawing.illumination_basis[0][GAIN], grey
+    both = drawing.illumination_basis[0][GAIN_INDEX], grey
     b = np.stack([np.einsum("kn,n->k", rows, each) for each in both], axis=1)
     shares = np.linalg.solve(A, b)
     bits, seen = (each - np.einsum("kn,k->n", rows, shares[:, k]) for k, each in enumerate(both))
@@ -437,13 +443,15 @@ def _grey_jacobian_under_illumination(drawing: RenderedDrawing, illumination: Ar
     the increment of the homography (8) and the variance of the blur (1), in squared node spacings.
     `illumination` (7 or 8,) contains the coefficients of the illumination, which converts the
     drawing to grey values, one per row of `RenderedDrawing.illumination_basis`."""
-    contrast_grey, (u, v, _) = float(illumination[GAIN]), drawing.grid.node_uv1
+    contrast_grey, (u, v, _) = float(illumination[GAIN_INDEX]), drawing.grid.node_uv1
     (white, changes), *others = drawing.blurred_whiteness_and_off_paper_fraction
-    bend = min(max(float(illumination[TONE_CURVE_BEND]) / contrast_grey, -0.9), 0.9)
-    slope = contrast_grey + illumination[GAIN_U] * u + illumination[GAIN_V] * v
+    bend = min(max(float(illumination[TONE_CURVE_BEND_INDEX]) / contrast_grey, -0.9), 0.9)
+    slope = (
+        contrast_grey + illumination[GAIN_SLOPE_U_INDEX] * u + illumination[GAIN_SLOPE_V_INDEX] * v
+    )
     slope = slope * (1.0 + bend * (1.0 - 2.0 * white))
     change: Array = changes * slope
-    for (_, more), height in zip(others, illumination[OFF_PAPER_GREY:], strict=True):
+    for (_, more), height in zip(others, illumination[OFF_PAPER_GREY_INDEX:], strict=True):
         change += more * height
     return change
 
@@ -466,11 +474,11 @@ class SamplingGrid:
 
 
 @lru_cache(maxsize=64)
-def make_sampling_grid(nodes_per_side: int, grid_reach_half_sides: float) -> SamplingGrid:
-    """Return a grid over the square from -grid_reach_half_sides to grid_reach_half_sides
+def make_sampling_grid(nodes_per_side: int, grid_half_width_half_sides: float) -> SamplingGrid:
+    """Return a grid over the square from -grid_half_width_half_sides to grid_half_width_half_sides
     around the marker's centre, with one node in the middle of each of its n by n equal parts
     (`nodes_per_side`)."""
-    node_positions_half_sides = grid_reach_half_sides * (
+    node_positions_half_sides = grid_half_width_half_sides * (
         (2.0 * np.arange(nodes_per_side) + 1.0) / nodes_per_side - 1.0
     )
     return SamplingGrid(
@@ -593,7 +601,16 @@ def gram_matrix(rows: Array) -> Array:
 _LOG_BLUR_TABLE_STEP = 0.02  # Relative step between the blurs in the table.
 # Rows of the illumination basis: offset and its slopes, gain and its slopes, bend of the tone
 # curve, grey beyond the sheet.
-OFFSET, OFFSET_U, OFFSET_V, GAIN, GAIN_U, GAIN_V, TONE_CURVE_BEND, OFF_PAPER_GREY = range(8)
+(
+    BLACK_LEVEL_INDEX,
+    BLACK_LEVEL_SLOPE_U_INDEX,
+    BLACK_LEVEL_SLOPE_V_INDEX,
+    GAIN_INDEX,
+    GAIN_SLOPE_U_INDEX,
+    GAIN_SLOPE_V_INDEX,
+    TONE_CURVE_BEND_INDEX,
+    OFF_PAPER_GREY_INDEX,
+) = range(8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -628,7 +645,7 @@ class RenderedDrawing:
         rows. The rows (7 or 8, n * n) are the black level and its slopes in x and y, the contrast
         (gain) and its slopes, and the bend of the tone curve. The eighth row, the grey beyond the
         paper, only exists if the size of the paper is known
-        (`MarkerDrawing.paper_reach_half_sides`)."""
+        (`MarkerDrawing.paper_half_width_half_sides`)."""
         u, v, one = self.grid.node_uv1
         (white, _), *others = self.blurred_whiteness_and_off_paper_fraction
         rows = [one, u, v, white, white * u, white * v, white * (1.0 - white)]
@@ -648,14 +665,14 @@ class RenderedDrawing:
             BLUR_MARGIN_NODES:-BLUR_MARGIN_NODES, BLUR_MARGIN_NODES:-BLUR_MARGIN_NODES
         ].reshape(1, -1)
         lit, _ = self.illumination_basis
-        rows = np.concatenate([lit[:GAIN], black, lit[OFF_PAPER_GREY:]])
+        rows = np.concatenate([lit[:GAIN_INDEX], black, lit[OFF_PAPER_GREY_INDEX:]])
         return rows, gram_matrix(rows)
 
     @cached_property
     def blurred_cell_coverage(self) -> Array:
         """Fraction of each node's width that each row (or column) of cells covers, along one axis
         and after the blur: (n, m) for n nodes and m cells per side."""
-        half_node = self.drawing.photometric_fit_reach_half_sides / self.grid.nodes_per_side
+        half_node = self.drawing.photometric_fit_half_width_half_sides / self.grid.nodes_per_side
         return blurred_cell_coverage(
             self.drawing, self.grid.node_positions_half_sides, half_node, self.blur_sigma_nodes
         )
@@ -670,7 +687,7 @@ def render_blurred(
     in node spacings. Only blurs from this table are rendered, so that the results can be cached."""
     return RenderedDrawing(
         drawing,
-        make_sampling_grid(nodes_per_side, drawing.photometric_fit_reach_half_sides),
+        make_sampling_grid(nodes_per_side, drawing.photometric_fit_half_width_half_sides),
         math.exp(_LOG_BLUR_TABLE_STEP * blur_table_index),
     )
 

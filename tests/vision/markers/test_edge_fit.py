@@ -127,7 +127,8 @@ def test_a_shift_that_all_edges_share_is_taken_out(light: str) -> None:
     biases, raw_biases = [], []
     closed = {
         n: replace(
-            r, are_first_two_inner_cells_white=np.zeros_like(r.are_first_two_inner_cells_white)
+            r,
+            are_two_cells_next_to_border_white=np.zeros_like(r.are_two_cells_next_to_border_white),
         )
         for n, r in RIMS.items()
     }

@@ -76,7 +76,7 @@ def test_corners_of_small_and_blurred_markers(
         assert is_alignment_confirmed(found)
         error = found.corners_px - true
         squares.append((error**2).mean())
-        assert np.abs(error).max() < 6.0 * found.sigma_px + 0.02
+        assert np.abs(error).max() < 6.0 * found.corner_sigma_px + 0.02
     assert math.sqrt(np.mean(squares)) < allowed_px
 
 
