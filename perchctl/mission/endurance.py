@@ -85,10 +85,10 @@ def _is_battery_reading_missing(c: Context) -> bool:
 def _time_until_landing_must_begin_s(
     c: Context, hover_times: HoverTimes | None, landing_duration_s: float
 ) -> float:
-    """Return the time, s, that is left for attempts before a landing must begin, according to the
-    predicted `hover_times`. Without a recent battery reading, it is also at most the time until row
-    `battery-unknown` lands the vehicle, minus the landing and the reserve; without a prediction
-    (`hover_times` is None), it is that time. Negative if the landing is already overdue."""
+    """Return the time, s, that is left for attempts before a landing must begin; negative if the
+    landing is overdue. It follows from the predicted `hover_times`. Without a recent battery
+    reading, it is at most the time until row `battery-unknown` lands the vehicle, minus the landing
+    and the reserve. If `hover_times` is None (no prediction), this limit is the result."""
     reserve_s = c.safety.energy_reserve_s
     by_charge_s = math.inf
     if hover_times is not None:
@@ -108,12 +108,11 @@ class HoverTimes:
     until_min_load_voltage_s: float  # until the voltage in hover falls below `safety.min_load_v`
 
     def until_landing_must_begin_s(self, landing_duration_s: float, reserve_s: float) -> float:
-        """Return the time, s, until a landing that takes `landing_duration_s` must begin: the
-        smaller of the time until row `battery-low` lands the vehicle, and the time until the
-        voltage in hover falls below `safety.min_load_v` minus the landing and `reserve_s`. Low
-        power does not stop the motors, so a landing that has begun can use the second time. Of both
-        predictions, only `TRUSTED_HOVER_TIME_FRACTION` is counted. Negative if a landing is
-        overdue."""
+        """Return the time, s, until a landing that takes `landing_duration_s` must begin; negative
+        if it is overdue. It is the smaller of two times: until row `battery-low` lands the vehicle;
+        and until the voltage in hover falls below `safety.min_load_v`, less `landing_duration_s`
+        and `reserve_s`. Low power does not stop the motors, so a landing may last beyond the first.
+        Only `TRUSTED_HOVER_TIME_FRACTION` of each predicted time is counted."""
         return min(
             TRUSTED_HOVER_TIME_FRACTION * self.until_battery_low_s,
             TRUSTED_HOVER_TIME_FRACTION * self.until_min_load_voltage_s
@@ -125,9 +124,10 @@ class HoverTimes:
 def predict_hover_times(
     battery_fit: BatteryFit, profile: Profile, hover_thrust_fraction: float, power_train: PowerTrain
 ) -> HoverTimes | None:
-    """Predict the hover times at a constant `hover_thrust_fraction` (fraction of full thrust).
-    Return None if that fraction is not positive, or if the battery fit has no resting voltage or
-    has not seen enough time under load.
+    """Predict the hover times at a constant `hover_thrust_fraction` (fraction of full thrust), for
+    motors with the current and the low-power voltage of `power_train`. Return None if that fraction
+    is not positive, or if the battery fit has no resting voltage or has not seen enough time under
+    load.
 
     Each time is the charge that remains above a voltage limit, divided by the rate of discharge in
     hover. The resting voltage at the limit is the limit plus the voltage sag, which is proportional
@@ -136,8 +136,8 @@ def predict_hover_times(
     The row `battery-low` applies at the earliest of these events: the firmware reports low power,
     `FIRMWARE_LOW_POWER_REPORT_DELAY_S` after the voltage in hover has fallen to the firmware's
     limit; the voltage in hover falls below `safety.min_load_v`; or, in a mission that perches, a
-    press would pull the voltage below `safety.min_load_v`. A press that is shorter than the
-    debounce time may pull it lower, by `MAX_DIP_BELOW_MIN_LOAD_VOLTAGE_IN_PRESS_V`.
+    press would pull the voltage below `safety.min_load_v`. A press that is shorter than
+    `safety.battery_debounce_s` may pull it lower, by `MAX_DIP_BELOW_MIN_LOAD_VOLTAGE_IN_PRESS_V`.
     """
     if (
         battery_fit.rest_v is None

@@ -18,9 +18,10 @@ def update_state_with_observation(
     """Return the planner's state with its belief updated by the observation `obs`; no decision is
     made. `maneuver` is the one that the vehicle is flying.
 
-    After a gap without ticks, the phase's conditions restart, and the catch of a falling vehicle is
-    cancelled with its setpoint. After a jump of the estimated position, the positions that the
-    state remembers are shifted by the same amount."""
+    After a gap without ticks, the phase's conditions restart, and if a falling vehicle was being
+    caught, the catch ends and its setpoint is deleted. After a jump of the estimated position, the
+    positions that the state remembers are shifted by the same amount.
+    """
     if has_tick_gap(state.belief, obs, profile):
         # The setpoint of a catch is far above the vehicle; keeping it would make the vehicle press
         # against the ceiling.
@@ -38,13 +39,14 @@ def update_state_with_observation(
 
 
 def _apply_world_frame_shift(state: PlannerState) -> PlannerState:
-    """Return the state after a jump of the estimated position, which has shifted the world frame:
-    the setpoint and the remembered positions are those of the belief, which has already shifted
-    its own.
+    """Return the state after a jump of the estimated position, which shifts the world frame: the
+    setpoint, the position at the start of the phase, and the height of an obstacle are shifted by
+    the same amount. The belief in `state` must have been shifted already.
 
     The firmware's own landing follows a trajectory in the old frame. If one is in progress with its
     motors running, it is forgotten: position control first catches the vehicle, and then the
-    landing is commanded again."""
+    landing is commanded again.
+    """
     b, vehicle_world_z_when_blocked_m = state.belief, state.vehicle_world_z_when_blocked_m
     if (
         state.phase is Phase.LANDING

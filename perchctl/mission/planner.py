@@ -92,8 +92,9 @@ def _update_before_decision(
 
 
 def _add_hover_error(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    """Return the state with the error of position and heading that the new picture shows during a
-    hover added to `state.hover_errors`. The observation must have a target estimate."""
+    """Return the state with one more frame counted in `state.hover_errors`: the vector from the
+    gear to the hover position in the level frame, m, and the target's heading relative to the
+    vehicle's, rad. `obs` must have a target estimate."""
     target, below_m = obs.target, (profile.planner.hover or HoverConfig()).below_m
     assert target is not None
     x_m, y_m, z_m = (float(each) for each in target.e_m)

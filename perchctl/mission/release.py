@@ -148,9 +148,9 @@ def transfer_weight_by_raw_thrust(c: Context, *, max_stale_telemetry_age_s: floa
     """Perform the second stage of the release: reduce raw thrust until the motors stop turning, and
     command the motor stop once the support has carried the whole weight for long enough.
 
-    With telemetry too old to count as evidence, the vehicle is held by position control instead,
-    and the stage starts over. Such telemetry is still accepted up to an age of
-    `max_stale_telemetry_age_s`; with 0, it is never accepted.
+    While the telemetry is not fresh and older than `max_stale_telemetry_age_s`, hold the vehicle by
+    position control instead; the stage then starts over. With 0, any telemetry that is not fresh
+    has this effect.
     """
     complete, state, b = c.planner.complete, c.state, c.belief
     if not b.is_imu_fresh and b.attitude_age_s > max_stale_telemetry_age_s:

@@ -152,9 +152,9 @@ def _is_significant(difference: float, threshold: float, sigma: float) -> bool:
 
 @dataclass(frozen=True)
 class HoverReport:
-    """Duration of a hover below the target, its intended distance below the target, and its RMS
-    errors as the camera measured them (`HoverErrors`): x forward, y left and z up in the level
-    frame, m, and heading, rad."""
+    """Duration of a hover below the target, s, the intended distance of the gear below the target,
+    m, and the RMS errors as the camera measured them (`HoverErrors`): x forward, y left and z up in
+    the level frame, m, and heading, rad."""
 
     duration_s: float
     hover_distance_below_target_m: float
@@ -183,8 +183,9 @@ class HoverReport:
 @dataclass(frozen=True)
 class FlightReport:
     """How a flight ended: its last phase, outcome and reason, the number of attempts, the duration,
-    the events, and findings about camera, contact, touchdown and hover. Each finding is None if it
-    is unknown or does not apply."""
+    s, whether the firmware's supervisor has locked the vehicle, the events, and findings about
+    camera, contact, touchdown and hover. Each finding is None if it is unknown or does not
+    apply."""
 
     phase: Phase
     outcome: Outcome

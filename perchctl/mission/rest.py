@@ -38,17 +38,19 @@ class RestState(Enum):
 
 
 def find_rest_state(c: Context) -> RestState:
-    """Return the rest state once the motors are off. It is HELD if an object other than the target
-    holds the vehicle.
+    """Return where the vehicle rests; only valid once the motors are off. The result is HELD if,
+    during a landing, an object other than the target holds the vehicle.
 
-    With a valid position from a deck or motion capture, the vehicle is hanging if no target is far
-    above, and it either has hardly come down since the phase began high above the ground or has a
-    recorded contact and is too high to rest on the floor; otherwise, it is on the floor. Without
-    such a position, it is on the floor if a tracked target is far above; otherwise, the falls
-    measured since it came within the magnet's reach decide
-    (`_find_rest_state_from_measured_falls`). After a restart of the vehicle, its estimate starts
-    again at the origin, so neither its earlier position nor a target that was last seen before the
-    restart proves anything.
+    If a deck or motion capture gives a valid position and the vehicle has not been restarted, its
+    height decides. It HANGS if the target is not known to be too far above to hold it, and either
+    it has come down by less than `MAX_HEIGHT_LOSS_IF_STILL_HANGING_M` since the phase began high
+    above the ground, or it has a recorded contact and is higher than
+    `MAX_HEIGHT_RESTING_ON_FLOOR_M` above the ground. Otherwise, it STANDS.
+
+    In all other cases, it STANDS if a tracked target is too far above to hold it; otherwise, the
+    falls that the accelerometer has measured decide (`_find_rest_state_from_measured_falls`). After
+    a restart, the position estimate starts again at the origin, so earlier positions and sightings
+    are not used.
     """
     b, state = c.belief, c.state
     if _is_held_by_other_object(c):
@@ -103,9 +105,10 @@ def _is_held_by_other_object(c: Context) -> bool:
 
 
 def _find_rest_state_from_measured_falls(c: Context) -> RestState:
-    """Return the rest state from the falls that the accelerometer has measured since the vehicle
-    came within the magnet's reach. The state is UNKNOWN after a gap in the telemetry that was long
-    enough for the vehicle to fall, or to be caught by the magnet, unnoticed."""
+    """Return the rest state from the falls that the accelerometer has measured: HANGS if the
+    vehicle has come within the magnet's reach and has neither fallen nor reached the floor since,
+    otherwise STANDS. The state is UNKNOWN if a gap in the telemetry was long enough to hide the
+    opposite: a fall, or a catch by the magnet."""
     b, dead_reckoning, since_s = (
         c.belief,
         c.belief.dead_reckoning,
@@ -130,13 +133,13 @@ def _find_rest_state_from_measured_falls(c: Context) -> RestState:
 
 
 def is_still_hanging(c: Context) -> bool:
-    """True if the vehicle is still hanging.
+    """True if the height or the accelerometer shows that the vehicle is still hanging.
 
-    With a recorded contact and a valid position from a deck or motion capture, the vehicle is
-    hanging if it is not sinking faster than `complete.slip_mps` and is at most
-    `MAX_HEIGHT_DRIFT_BELOW_CONTACT_IF_HANGING_M` below its contact. Failing that, it is hanging if
-    the accelerometer has measured no fall since it came within the magnet's reach and no gap can
-    hide one (`_find_rest_state_from_measured_falls`).
+    The height shows it if a deck or motion capture gives a valid position, a contact is recorded,
+    and the vehicle is at most `MAX_HEIGHT_DRIFT_BELOW_CONTACT_IF_HANGING_M` below that contact and
+    not sinking faster than `complete.slip_mps`. The accelerometer shows it if it has measured no
+    fall since the vehicle came within the magnet's reach, and no gap in the telemetry can hide one
+    (`_find_rest_state_from_measured_falls`).
     """
     b, tel = c.belief, c.telemetry
     if (

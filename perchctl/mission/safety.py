@@ -119,9 +119,9 @@ ends the flight."""
 
 def is_position_control_diverging(c: Context) -> bool:
     """True if position control leads the vehicle away from its setpoint, as with external positions
-    in the wrong axes: it is further away than any draught could move it, it oscillates, or its
-    estimated velocity contradicts the accelerometer. Always False with a deck or without a valid
-    position."""
+    in the wrong axes: it is further away than any draught could move it, it oscillates vertically,
+    or its estimated velocity contradicts the accelerometer. Always False if the position comes from
+    a deck or is not valid."""
     setpoint, phase, b = c.state.setpoint, c.state.phase, c.belief
     if b.profile.positioning.source.is_deck or not b.is_position_valid:
         return False
@@ -246,7 +246,8 @@ def is_outside_fleet_corridor(c: Context) -> bool:
 
 
 def wrong_camera_latency_reason(c: Context) -> str:
-    """Return a message with the measured age of the pictures and the age that was expected."""
+    """Return a message with the measured age of the pictures and the age that was expected; with
+    late telemetry, with the disagreement of their times instead."""
     camera, b = c.profile.camera, c.belief
     assumed_s = camera.start_latency_s + c.obs.camera_latency_above_profile_s
     error_s = b.camera_imu_mismatch.camera_latency_error_s

@@ -84,8 +84,8 @@ def make_setpoint_at_vehicle(c: Context) -> PositionSetpoint:
 
 
 def vehicle_world_xy_with_gear_under_target_m(c: Context, yaw_rad: float) -> tuple[float, float]:
-    """Return the world x and y (m) of the body at which its gear is below the target, for the
-    heading `yaw_rad` of the vehicle. The target's position must be known."""
+    """Return the world x and y, m, that the body's origin must have for the gear to be below the
+    target, if the vehicle's heading is `yaw_rad`. The target's position must be known."""
     target = c.belief.target.world_position_m
     assert target is not None
     gear = rot_z(yaw_rad) @ c.profile.vehicle.gear_body_m
@@ -150,9 +150,10 @@ def fly_to(c: Context, reference: PositionSetpoint, *, corrects_height: bool = T
 
 
 def fly_under_target(c: Context, vehicle_world_z_m: float, *, max_up_mps: float = 0.0) -> Action:
-    """Move under the target at height `vehicle_world_z_m` (world z of the body), and learn the
-    integral that keeps the gear there. The setpoint climbs at no more than `max_up_mps`; by
-    default, it does not climb."""
+    """Return the state and the command that move the gear under the target, with the body's origin
+    at world z `vehicle_world_z_m`. The setpoint climbs at no more than `max_up_mps`; by default, it
+    does not climb. The state's lateral integral, which shifts the setpoint against a steady wind,
+    is updated (`update_lateral_integral`)."""
     goal = make_setpoint_under_target(c, vehicle_world_z_m)
     integral_setpoint_shift_xy_m = update_lateral_integral(
         c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s
@@ -172,10 +173,12 @@ def update_lateral_integral(
 ) -> tuple[float, float]:
     """Return the integral (x, y) over time of the lateral position error to `goal_world_xy_m`,
     times the gain `integral_per_s`: a shift of the setpoint, m, world axes, that removes the offset
-    which a steady wind leaves.
+    which a steady wind leaves. `dt_s` is the time since the last update.
 
-    The integral is limited, and frozen while the vehicle is still on its way: a large error
-    accumulates, and the integral may become large, only while the vehicle hovers in place.
+    While the vehicle hovers in place (slower than `MAX_SPEED_TO_COUNT_AS_HOVERING_MPS`), any error
+    is integrated, up to a shift of `MAX_LATERAL_INTEGRAL_SHIFT_M`. While it moves, only errors
+    below `MAX_LATERAL_ERROR_TO_INTEGRATE_IN_MOTION_M` are, and the shift does not grow beyond
+    `integral_limit_m`.
     """
     planner = c.planner
     ex = goal_world_xy_m[0] - c.telemetry.position_m[0]

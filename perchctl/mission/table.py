@@ -61,13 +61,13 @@ PHASE_CONDITIONS = tuple(each for phase in PHASES.values() for each in phase.tim
 def find_first_matching_transition(
     c: Context, table: tuple[Transition, ...] = TABLE
 ) -> Transition | None:
-    """Return the first row of `table` that applies: the present phase is one of its phases, and its
-    `when` is true. Return None if no row applies, and the mission stays in its phase. Once the
-    mission is landing, rows to a phase before the landing are skipped.
+    """Return the row of `table` that decides this tick; None if no row applies, so that the mission
+    stays in its phase. A row applies if the present phase is one of its phases and its `when` is
+    true. Once the mission is landing, rows to a phase before the landing are skipped.
 
-    A row that keeps the mission in its phase (a wait) is returned only if no later row of a
-    severity above `CONTINUE` leaves the phase. Later rows of severity `CONTINUE` (normal progress)
-    are skipped, so that a wait delays only normal progress.
+    This is the first row that applies, with one exception. If that row keeps the mission in its
+    phase (a wait), a later row with a severity above `CONTINUE` (normal progress) that applies and
+    is no wait is returned instead, so that a wait delays only normal progress.
     """
     landing, phase = c.state.severity >= Severity.LAND, c.state.phase
     waits: Transition | None = None

@@ -64,8 +64,8 @@ def motor_cut_row(
 
 def supervisor_abort_row(name: str, supervisor_bit: int, reason: str) -> Transition:
     """Return a row called `name` that stops the motors in any airborne phase and ends the flight in
-    ABORTED once the firmware's supervisor has set `supervisor_bit`, a bit mask such as
-    `perchctl.vehicle.TUMBLED`. `reason` is shown to the user."""
+    ABORTED, with the outcome SAFETY, once the firmware's supervisor has set `supervisor_bit`, a bit
+    mask such as `perchctl.vehicle.TUMBLED`. `reason` is shown to the user."""
 
     def when(c: Context) -> bool:
         return c.telemetry.has_bit(supervisor_bit)

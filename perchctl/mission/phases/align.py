@@ -47,7 +47,8 @@ CLIMB_WITHHELD = Condition[Context](
 
 
 def act_in_align(c: Context) -> Action:
-    """Move under the target at the setpoint's height."""
+    """Move under the target at the height of the present setpoint or, without one, of the
+    vehicle."""
     return fly_under_target(c, (c.state.setpoint or make_setpoint_at_vehicle(c)).z_m)
 
 

@@ -108,8 +108,8 @@ def _is_at_hover_position(c: Context) -> bool:
 
 
 def is_returning_to_hover_height(state: PlannerState) -> bool:
-    """True if the vehicle has sunk during its hover and this ascent returns it to the hover
-    position."""
+    """True in an ASCEND that brings the vehicle back to its hover position after it has sunk during
+    its hover. False in the first ASCEND to that position and in all other phases."""
     return (
         state.phase is Phase.ASCEND
         and VehicleDiagnosis.RETURNING_TO_HOVER_HEIGHT in state.entry.diagnosis

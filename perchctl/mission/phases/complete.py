@@ -31,9 +31,9 @@ thrust, s."""
 
 
 def enter_complete(state: PlannerState, previous_context: Context) -> PlannerState:
-    """Record the contact: the magnet holds the vehicle where `previous_context`, the context before
-    the transition in the same tick, places it. The offset is that of the last touch or, if it is
-    not valid, the present one."""
+    """Record where the magnet holds the vehicle: the vehicle's world z in `previous_context`, the
+    context before the transition in the same tick, and the lateral distance between gear and target
+    at the last touch or, if that is not valid, the present one."""
     belief = replace(
         state.belief,
         vehicle_world_z_at_last_contact_m=previous_context.telemetry.position_m[2],

@@ -26,7 +26,8 @@ TARGET_POSITION_STEADY = Condition[Context](
 
 
 def act_in_estimate(c: Context) -> Action:
-    """Hold the setpoint while several frames confirm the target's position."""
+    """Hold the setpoint, or the vehicle's position if there is none, while several frames confirm
+    the target's position."""
     return fly_to(c, c.state.setpoint or make_setpoint_at_vehicle(c))
 
 

@@ -19,10 +19,10 @@ def stay_idle(c: Context) -> Action:
 
 
 def act_in_aborted(c: Context) -> Action:
-    """Send one command in the first tick of ABORTED, and none after that. The command is the stop
-    command of the transition. Without one, the motors are stopped if the thrust has already been
-    ramped down or the descent has reached its end: otherwise, the firmware would lock a vehicle
-    whose setpoints end. In all other cases, nothing is sent."""
+    """In the first tick of ABORTED, return the stop command of the transition or, if it has none,
+    `StopMotors` if the raw thrust has already been ramped down or the descent has reached its end.
+    Without `StopMotors`, the firmware would then lock a vehicle whose setpoints end. Return `Idle`
+    (nothing is sent) in all other cases and in all later ticks."""
     if c.state.stop_or_land_command_count:
         return c.state, Idle()
     ends = (

@@ -66,9 +66,10 @@ def time_since_hover_began_s(c: Context) -> float:
 
 
 def enter_hover(state: PlannerState, previous_context: Context) -> PlannerState:
-    """Restart the hover timer and the position errors. Both continue if `previous_context`, the
-    context before the transition in the same tick, shows that the vehicle has only climbed back to
-    its hover position, within `MAX_HEIGHT_RETURN_DURATION_TO_KEEP_HOVER_TIMER_S`."""
+    """Restart the hover timer and the position errors, unless `previous_context`, the context
+    before the transition in the same tick, shows that the vehicle has only climbed back to its
+    hover position, in at most `MAX_HEIGHT_RETURN_DURATION_TO_KEEP_HOVER_TIMER_S`. Timer and errors
+    then continue."""
     if (
         is_returning_to_hover_height(previous_context.state)
         and previous_context.time_in_phase_s <= MAX_HEIGHT_RETURN_DURATION_TO_KEEP_HOVER_TIMER_S

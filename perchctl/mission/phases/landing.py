@@ -20,13 +20,15 @@ vehicle, s."""
 
 
 def enter_landing(state: PlannerState, previous_context: Context) -> PlannerState:
-    """Start the descent, according to the diagnosis of the transition into LANDING.
+    """Start the descent as the diagnosis of the transition into LANDING requires.
+    `previous_context` is the context before the transition, in the same tick.
 
-    If external positions are wrong, or if the target moved with the vehicle in a flight by motion
-    capture (wrong mounting or wrong axes), the descent does not use positions. If the camera's
-    mounting is wrong, the setpoint is dropped. After RECOVER, the phase in `previous_context` (the
-    context before the transition in the same tick), the offset of the last touch is forgotten,
-    unless the diagnosis says that the vehicle is hanging there.
+    The descent does not use positions if the diagnosis says that the external positions are wrong,
+    or if it says that the camera's mounting is wrong and, in a flight by motion capture, the target
+    moved with the vehicle: the axes of the positions may be wrong instead. With a wrong mounting,
+    the setpoint is dropped. If the previous phase was RECOVER, the recorded distance between gear
+    and target at the last touch is deleted, unless the diagnosis says that the vehicle is hanging
+    there.
     """
     diagnosis, b = state.entry.diagnosis, state.belief
     # The mounting may be right and the axes of the motion capture wrong. Position control would
@@ -53,8 +55,8 @@ def enter_landing(state: PlannerState, previous_context: Context) -> PlannerStat
 
 
 def make_rest_state_predicate(rest_state: RestState) -> Predicate:
-    """Return a predicate that is true once the motors are off and the vehicle is in the rest state
-    `rest_state`."""
+    """Return a predicate that is true once the motors have been off for `MOTORS_OFF_DWELL_S` and
+    the vehicle is in the rest state `rest_state`."""
     return lambda c: (
         c.true_for_s(MOTORS_OFF_AS_COMMANDED) >= MOTORS_OFF_DWELL_S
         and find_rest_state(c) is rest_state
@@ -79,9 +81,10 @@ def unconfirmed_landing_reason(c: Context) -> str:
 
 
 def _outcome_if_landing_ends_hanging(previous_outcome: Outcome | None) -> Outcome | None:
-    """Return the outcome of a flight that ends on the magnet. TARGET_NOT_FOUND becomes
-    ATTEMPTS_USED_UP, since the vehicle is hanging on a target; HOVERED becomes SAFETY, since a
-    hover must not end on the magnet; other outcomes are kept."""
+    """Return the outcome of a flight whose landing ends with the vehicle hanging on the magnet.
+    TARGET_NOT_FOUND becomes ATTEMPTS_USED_UP, since the vehicle is hanging on a target; HOVERED
+    becomes SAFETY, since a hover must not end on the magnet; any other outcome, or None, is
+    kept."""
     if previous_outcome is Outcome.HOVERED:
         return Outcome.SAFETY
     return (

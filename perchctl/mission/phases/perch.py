@@ -59,12 +59,14 @@ def act_in_perch(c: Context) -> Action:
 
 
 def is_contact_proven(c: Context) -> bool:
-    """True if the condition `TARGET_CONTACT` has been true for `perch.contact_dwell_s`."""
+    """True if the evidence has shown for `perch.contact_dwell_s` without interruption that the gear
+    is in contact with the target (condition `TARGET_CONTACT`)."""
     return c.true_for_s(TARGET_CONTACT) >= c.planner.perch.contact_dwell_s
 
 
 def contact_evidence_text(c: Context) -> str:
-    """Return, in words, what proves the contact, and the gear's offset from the target's axis."""
+    """Return a message that names the evidence for the contact and tells how far the gear is from
+    the target's axis."""
     by = "position, acceleration and thrust"
     if not c.belief.is_position_valid:
         by = f"acceleration and thrust ({position_loss_text(c.belief)})"

@@ -118,9 +118,10 @@ def _find_gear_to_target_at_touch(
 
 
 def act_in_recover(c: Context) -> Action:
-    """Catch a fall and end the press first. Then hold `recover.descend_m` below the position where
-    the attempt ended or, if the target was seen recently, below the target at that height, in
-    position mode throughout. After a catch, the height is that at which the fall stopped."""
+    """Command position setpoints throughout: first to catch a falling vehicle, then to end a press,
+    and then to hold `recover.descend_m` below the position where the attempt ended or, after a
+    catch, where the fall stopped. If the target was seen in the last
+    `MAX_SIGHTING_AGE_TO_FOLLOW_TARGET_S`, the vehicle holds that height below the target."""
     if (caught := catch_falling_vehicle(c)) is not None:
         return caught
     recover = c.planner.recover

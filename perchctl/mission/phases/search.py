@@ -78,10 +78,10 @@ def _limit_move_before_camera_mounting_check(
     start_world_xy_m: tuple[float, float],
     goal_world_xy_m: tuple[float, float],
 ) -> tuple[float, float]:
-    """Return the goal, world x and y (m). A goal that is further than
-    `MAX_LATERAL_MOVE_BEFORE_CAMERA_MOUNTING_CHECK_M` from the vehicle's position at the last
-    sighting in `mounting` is moved towards that position, to this distance. Without a sighting, the
-    distance is measured from `start_world_xy_m`."""
+    """Return `goal_world_xy_m`, limited to a circle of radius
+    `MAX_LATERAL_MOVE_BEFORE_CAMERA_MOUNTING_CHECK_M`: a goal outside is moved towards the centre
+    onto the circle. The centre is the vehicle's position at the last sighting in `mounting` or,
+    without a sighting, `start_world_xy_m`. All positions are world x and y, m."""
     if mounting.sightings:
         start_world_xy_m = (
             mounting.sightings[-1].vehicle_world_xy_m.real,
