@@ -61,7 +61,7 @@ from perchctl.mission.release import (
 )
 from perchctl.mission.setpoints import (
     Action,
-    limit_setpoint_to_fence_and_height,
+    limit_setpoint_to_fence_and_height_range,
     make_setpoint_at_vehicle,
     move_setpoint_to_vehicle,
     step_setpoint_towards,
@@ -442,7 +442,7 @@ def _descend_by_setpoints(c: Context) -> Action:
     state = replace(state, setpoint=setpoint, catch_setpoint_height_above_vehicle_m=None)
     dx, dy = state.integral_setpoint_shift_xy_m
     sent = replace(setpoint, x_m=setpoint.x_m + dx, y_m=setpoint.y_m + dy)
-    return state, limit_setpoint_to_fence_and_height(c, sent)
+    return state, limit_setpoint_to_fence_and_height_range(c, sent)
 
 
 def _descend_by_raw_thrust(c: Context) -> Action:
@@ -462,7 +462,7 @@ def _descend_by_raw_thrust(c: Context) -> Action:
         and c.t_s - descent.heading_setpoint_sent_at_s >= MIN_TIME_BETWEEN_HEADING_SETPOINTS_S
         and all(map(math.isfinite, (*b.telemetry.position_m, b.telemetry.yaw_rad)))
     ):
-        setpoint = limit_setpoint_to_fence_and_height(c, make_setpoint_at_vehicle(c))
+        setpoint = limit_setpoint_to_fence_and_height_range(c, make_setpoint_at_vehicle(c))
         if setpoint.z_m <= b.telemetry.position_m[2]:
             descent = replace(descent, heading_setpoint_sent_at_s=c.t_s)
             return replace(c.state, descent=descent, setpoint=setpoint), setpoint

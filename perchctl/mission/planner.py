@@ -26,7 +26,12 @@ from perchctl.mission.phases.approach import MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M
 from perchctl.mission.phases.hover import is_hovering
 from perchctl.mission.setpoints import Action, fly_to, lower_held_setpoint
 from perchctl.mission.state import PhaseEntry, PlannerState
-from perchctl.mission.table import PHASE_CONDITIONS, PHASES, TABLE, find_first_matching_transition
+from perchctl.mission.table import (
+    PHASE_TIMED_CONDITIONS,
+    PHASES,
+    TABLE,
+    find_first_matching_transition,
+)
 from perchctl.mission.transition import Transition
 from perchctl.profile import HoverConfig, Profile
 from perchctl.values import replace
@@ -77,10 +82,10 @@ def _update_before_decision(
         )
         consecutive_target_frames = consecutive_target_frames + 1 if measured else 0
         if measured and is_hovering(state):
-            state = _add_hover_error(state, obs, profile)
+            state = _accumulate_hover_error(state, obs, profile)
     hold = hold_reason(state.belief, maneuver)
     condition_start_times_s = update_condition_start_times(
-        state.condition_start_times_s, PHASE_CONDITIONS, Context(state), obs.t_s
+        state.condition_start_times_s, PHASE_TIMED_CONDITIONS, Context(state), obs.t_s
     )
     state = replace(
         state,
@@ -91,7 +96,9 @@ def _update_before_decision(
     return replace(state, battery=compute_battery_outlook(Context(state)))
 
 
-def _add_hover_error(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
+def _accumulate_hover_error(
+    state: PlannerState, obs: Observation, profile: Profile
+) -> PlannerState:
     """Return the state with one more frame counted in `state.hover_errors`: the vector from the
     gear to the hover position in the level frame, m, and the target's heading relative to the
     vehicle's, rad. `obs` must have a target estimate."""

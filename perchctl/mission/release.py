@@ -15,7 +15,7 @@ from perchctl.mission.context import Context
 from perchctl.mission.setpoints import (
     Action,
     correct_setpoint,
-    limit_setpoint_to_fence_and_height,
+    limit_setpoint_to_fence_and_height_range,
     make_setpoint_at_vehicle,
 )
 from perchctl.mission.state import PlannerState
@@ -43,10 +43,10 @@ MAX_PRESS_DURATION_FOR_GRADUAL_RELEASE_S = 1.5
 at once instead of in steps: by then, the onboard integrator has wound up, and it unwinds slowly by
 itself. Larger: a press whose contact is proven late, because the thrust was not reported, lasts
 longer than 4 s."""
-MIN_RAW_PRESS_TO_HOLD_PROOF_THRUST_RATIO = 0.9
+REDUCED_PRESS_TO_MAGNET_HOLD_PROOF_THRUST_RATIO = 0.9
 """The raw thrust of a press is lowered to this fraction of `complete.hold_ratio` times hover
 thrust, the largest thrust that proves that the magnet holds the vehicle (too little to fly)."""
-EXTRA_HANGING_TIME_IF_THRUST_UNCONFIRMED_S = 1.5
+EXTRA_HANGING_DWELL_IF_THRUST_UNCONFIRMED_S = 1.5
 """Additional hang time if the reported thrust does not follow the commanded one, s."""
 
 # --- stop ---
@@ -71,7 +71,7 @@ MAX_FALL_CATCH_DURATION_S = 2.0
 """Longest duration of a catch, s."""
 MIN_CLIMB_RATE_TO_END_FALL_CATCH_MPS = -0.1
 """Vertical speed above which the catch ends, m/s: the thrust then exceeds the weight."""
-MAX_BRAKED_LATERAL_SPEED_MPS = 1.0
+MAX_LATERAL_SPEED_BRAKED_IN_FALL_CATCH_MPS = 1.0
 """Largest lateral speed that is braked, m/s; no impact that the vehicle survives leaves a
 higher one."""
 ONBOARD_POSITION_GAIN_PER_S = 2.0
@@ -105,7 +105,7 @@ def end_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     setpoint = PositionSetpoint(
         x + dx, y + dy, tel.position_m[2] - setpoint_below_vehicle_m, state.entry.yaw_rad
     )
-    return state, limit_setpoint_to_fence_and_height(c, setpoint)
+    return state, limit_setpoint_to_fence_and_height_range(c, setpoint)
 
 
 def reduce_press_before_weight_transfer(c: Context) -> Action:
@@ -126,7 +126,9 @@ def reduce_press_before_weight_transfer(c: Context) -> Action:
     if perch.mode == "raw":
         if not b.is_imu_fresh:
             return hold_contact_by_position(c)
-        lowest = MIN_RAW_PRESS_TO_HOLD_PROOF_THRUST_RATIO * complete.hold_ratio * b.hover_thrust
+        lowest = (
+            REDUCED_PRESS_TO_MAGNET_HOLD_PROOF_THRUST_RATIO * complete.hold_ratio * b.hover_thrust
+        )
         return state, RawThrust(int(perch.thrust + part * (lowest - perch.thrust)))
     setpoint = state.setpoint or make_setpoint_at_vehicle(c)
     assert b.vehicle_world_z_at_last_contact_m is not None
@@ -138,7 +140,7 @@ def reduce_press_before_weight_transfer(c: Context) -> Action:
     top = state.entry.position_m[2] + perch.press_m + slid_m
     low = b.vehicle_world_z_at_last_contact_m - complete.release_drop_m + slid_m
     setpoint = replace(setpoint, z_m=top + part * (low - top))
-    sent = limit_setpoint_to_fence_and_height(
+    sent = limit_setpoint_to_fence_and_height_range(
         c, correct_setpoint(c, setpoint, corrects_height=False)
     )
     return replace(state, setpoint=setpoint), sent
@@ -167,7 +169,7 @@ def transfer_weight_by_raw_thrust(c: Context, *, max_stale_telemetry_age_s: floa
         state = replace(state, weight_transfer_began_at_s=weight_transfer_began_at_s, belief=b)
     hung_s = c.true_for_s(HANGING_WITH_MOTORS_STOPPED)
     unconfirmed = b.thrust_last_differed_from_command_at_s >= c.t_s - hung_s
-    extra_s = EXTRA_HANGING_TIME_IF_THRUST_UNCONFIRMED_S if unconfirmed else 0.0
+    extra_s = EXTRA_HANGING_DWELL_IF_THRUST_UNCONFIRMED_S if unconfirmed else 0.0
     if hung_s >= complete.hang_s + extra_s:
         return stop_motors(c)
     part = min(1.0, (c.t_s - weight_transfer_began_at_s) / complete.ramp_s)
@@ -191,7 +193,7 @@ def hold_contact_by_position(c: Context) -> Action:
     )
     return replace(
         state, setpoint=setpoint, weight_transfer_began_at_s=None
-    ), limit_setpoint_to_fence_and_height(c, setpoint)
+    ), limit_setpoint_to_fence_and_height_range(c, setpoint)
 
 
 def has_thrust_ramped_down(c: Context) -> bool:
@@ -274,19 +276,25 @@ def catch_falling_vehicle(c: Context) -> Action | None:
             tel.position_m[2] + state.catch_setpoint_height_above_vehicle_m,
             state.entry.yaw_rad,
         )
-        return replace(state, setpoint=setpoint), limit_setpoint_to_fence_and_height(c, setpoint)
+        return replace(state, setpoint=setpoint), limit_setpoint_to_fence_and_height_range(
+            c, setpoint
+        )
     return None
 
 
 def _braking_setpoint_world_xy_m(c: Context) -> tuple[float, float]:
     """Return world x and y, m, of a setpoint that brakes the lateral velocity that dead reckoning
     shows and the state estimate does not (the difference between the two). The setpoint is behind
-    the vehicle, opposite to this velocity, by the velocity (at most `MAX_BRAKED_LATERAL_SPEED_MPS`
-    per axis) divided by `ONBOARD_POSITION_GAIN_PER_S`."""
+    the vehicle, opposite to this velocity, by the velocity (at most
+    `MAX_LATERAL_SPEED_BRAKED_IN_FALL_CATCH_MPS` per axis) divided by
+    `ONBOARD_POSITION_GAIN_PER_S`."""
     tel, reckoned_mps = c.telemetry, c.belief.dead_reckoning.velocity_world_mps
     missing_mps = (reckoned_mps[i] - tel.velocity_mps[i] for i in range(2))
     x_mps, y_mps = (
-        max(-MAX_BRAKED_LATERAL_SPEED_MPS, min(MAX_BRAKED_LATERAL_SPEED_MPS, mps))
+        max(
+            -MAX_LATERAL_SPEED_BRAKED_IN_FALL_CATCH_MPS,
+            min(MAX_LATERAL_SPEED_BRAKED_IN_FALL_CATCH_MPS, mps),
+        )
         for mps in missing_mps
     )
     x_m, y_m, _ = tel.position_m

@@ -22,7 +22,7 @@ from perchctl.vision import CameraCalibrationErrors
 
 MIN_HARD_TOUCHDOWN_SPEED_MPS = 0.6
 """Touchdown speed above which a landing is hard, m/s; no normal descent is faster."""
-MAX_TOUCHDOWN_TO_MOTOR_STOP_S = 5.0
+MAX_TIME_FROM_TOUCHDOWN_TO_MOTOR_STOP_S = 5.0
 """Longest time from a touchdown to the stop of the motors, s; an earlier impact was not the
 floor."""
 MAX_TOUCHDOWN_HEIGHT_ABOVE_FINAL_POSITION_M = 0.3
@@ -286,9 +286,9 @@ def report_rest_state(
 
 def find_touchdown(c: Context) -> Touchdown | None:
     """Return the newest impact from below if it may be the touchdown. Return None if the vehicle is
-    perched, if the impact was more than `MAX_TOUCHDOWN_TO_MOTOR_STOP_S` before the motors stopped
-    (or before now, if they are still turning), or if a valid position shows that it was too far
-    above the final position.
+    perched, if the impact was more than `MAX_TIME_FROM_TOUCHDOWN_TO_MOTOR_STOP_S` before the motors
+    stopped (or before now, if they are still turning), or if a valid position shows that it was too
+    far above the final position.
 
     The downward speed, m/s, comes from dead reckoning if that has replaced the state estimate or if
     positions have diverged; otherwise, it comes from the state estimate.
@@ -298,7 +298,8 @@ def find_touchdown(c: Context) -> Touchdown | None:
     impact = imu.newest_impact
     if (
         c.state.phase is Phase.PERCHED
-        or min(tel.t_s, imu.motors_stopped_at_s) - impact.t_s > MAX_TOUCHDOWN_TO_MOTOR_STOP_S
+        or min(tel.t_s, imu.motors_stopped_at_s) - impact.t_s
+        > MAX_TIME_FROM_TOUCHDOWN_TO_MOTOR_STOP_S
     ):
         return None
     higher = impact.world_z_m - tel.position_m[2] > MAX_TOUCHDOWN_HEIGHT_ABOVE_FINAL_POSITION_M

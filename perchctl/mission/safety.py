@@ -77,7 +77,7 @@ SETPOINT_DISTANCE_LIMIT_INCREASE_PER_LATENCY_SIGMA_MPS = 4.0
 the camera latency, m per second of its standard deviation, if the target is the position source.
 Pictures that arrive 0.1 s later than assumed displace the vehicle by up to 0.2 m. Larger: a rotated
 camera leads the vehicle further away."""
-MAX_LATERAL_SETPOINT_OFFSET_IN_VERTICAL_CLIMB_M = 0.1
+MAX_LATERAL_SETPOINT_TO_TAKEOFF_DISTANCE_IN_VERTICAL_CLIMB_M = 0.1
 """Largest lateral distance between setpoint and start in a vertical climb, m."""
 ESTIMATE_CONTRADICTS_IMU_DWELL_S = 0.1
 """Time for which the estimate must contradict the accelerometer, s."""
@@ -108,7 +108,7 @@ reached about 3 s after the last sighting."""
 MIN_SIGHTING_TO_ESTIMATE_DISTANCE_IF_ESTIMATE_WRONG_M = 0.3
 """Distance of the newest sighting from the estimate beyond which the estimate is wrong, m. Larger:
 position control moves the vehicle further away. Smaller: an oscillation ends the flight."""
-MIN_POSITION_AGE_TO_TRUST_REJECTED_SIGHTINGS_S = 0.35
+MIN_POSITION_CORRECTION_AGE_TO_TRUST_REJECTED_SIGHTINGS_S = 0.35
 """Age of the newest position, including the latency, at which contradicting sightings can no longer
 be a single mistake, s. Larger: position control diverges for longer. Smaller: one wrong detection
 ends the flight."""
@@ -154,7 +154,7 @@ def is_position_control_diverging(c: Context) -> bool:
     ground = b.takeoff_position_m
     above_start = ground is not None and (
         math.hypot(setpoint.x_m - ground[0], setpoint.y_m - ground[1])
-        < MAX_LATERAL_SETPOINT_OFFSET_IN_VERTICAL_CLIMB_M
+        < MAX_LATERAL_SETPOINT_TO_TAKEOFF_DISTANCE_IN_VERTICAL_CLIMB_M
     )
     only_climbs = above_start and phase in (Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE)
     is_pushed = (
@@ -217,7 +217,7 @@ def is_position_lost(c: Context) -> bool:
     if b.position_correction_age_s > c.profile.positioning.land_s or b.is_estimate_missing_gust:
         return True
     if (
-        b.position_correction_age_s > MIN_POSITION_AGE_TO_TRUST_REJECTED_SIGHTINGS_S
+        b.position_correction_age_s > MIN_POSITION_CORRECTION_AGE_TO_TRUST_REJECTED_SIGHTINGS_S
         and c.obs.rejected_sighting_to_estimate_distance_m
         > MIN_SIGHTING_TO_ESTIMATE_DISTANCE_IF_ESTIMATE_WRONG_M
     ):
@@ -372,7 +372,7 @@ def is_thrust_insufficient_to_fly_or_press(c: Context) -> bool:
     )
 
 
-def _outcome_if_locked_while_hanging(previous_outcome: Outcome | None) -> Outcome:
+def _outcome_if_supervisor_locks_hanging_vehicle(previous_outcome: Outcome | None) -> Outcome:
     """Return the outcome if the supervisor has locked a hanging vehicle. HOVERED becomes SAFETY,
     since a hover must end on the floor; any other outcome is kept; without an outcome, the result
     is PERCHED."""
@@ -404,7 +404,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
         lambda c: c.telemetry.has_bit(LOCKED) and is_hanging_with_motors_off(c),
         Phase.PERCHED,
         "hanging, but the supervisor has locked the vehicle: restart it before the next flight",
-        outcome=_outcome_if_locked_while_hanging,
+        outcome=_outcome_if_supervisor_locks_hanging_vehicle,
     ),
     supervisor_abort_row(
         "locked", LOCKED, "the supervisor has locked the vehicle: inspect and restart it"

@@ -144,7 +144,7 @@ def fly_to(c: Context, reference: PositionSetpoint, *, corrects_height: bool = T
     """Store the setpoint `reference`, where the vehicle should be, and send a setpoint that brings
     it there in spite of wind and onboard control errors (`correct_setpoint`). Without
     `corrects_height`, the height sent is that of `reference`."""
-    return replace(c.state, setpoint=reference), limit_setpoint_to_fence_and_height(
+    return replace(c.state, setpoint=reference), limit_setpoint_to_fence_and_height_range(
         c, correct_setpoint(c, reference, corrects_height=corrects_height)
     )
 
@@ -327,7 +327,9 @@ def lower_held_setpoint(c: Context, setpoint: PositionSetpoint) -> PositionSetpo
     return replace(setpoint, z_m=max(lowest_m, z_m))
 
 
-def limit_setpoint_to_fence_and_height(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
+def limit_setpoint_to_fence_and_height_range(
+    c: Context, setpoint: PositionSetpoint
+) -> PositionSetpoint:
     """Return the setpoint moved inside the fence, below the height limit, and at least
     `MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M` above the ground; in a take-off, at least at the ground.
     The setpoint is unchanged while the take-off position is unknown."""

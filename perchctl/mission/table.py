@@ -54,7 +54,7 @@ EXIT_ROWS: tuple[Transition, ...] = tuple(row for phase in PHASES.values() for r
 """The phases' own rows, in the order of `PHASES`."""
 TABLE: tuple[Transition, ...] = (*SAFETY_ROWS, *EXIT_ROWS)
 """The built-in table: safety rows first, then the exits of the phases."""
-PHASE_CONDITIONS = tuple(each for phase in PHASES.values() for each in phase.timed_conditions)
+PHASE_TIMED_CONDITIONS = tuple(each for phase in PHASES.values() for each in phase.timed_conditions)
 """The phases' own conditions; `update_belief` updates those of the belief."""
 
 

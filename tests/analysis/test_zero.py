@@ -40,8 +40,10 @@ def test_all_outputs_of_a_log_have_one_zero(monkeypatch: pytest.MonkeyPatch) -> 
     assert log.start_s == corpus("perched").start_s  # without ticks by the first flown turn
     rows = csv.DictReader(StringIO(log.csv()))
     shown = show_record(FlightAnalysis(log))["phases"]
-    others = tuple(each for each in planner.PHASE_CONDITIONS if each is not SETTLED_AT_STANDOFF)
-    monkeypatch.setattr(planner, "PHASE_CONDITIONS", others)
+    others = tuple(
+        each for each in planner.PHASE_TIMED_CONDITIONS if each is not SETTLED_AT_STANDOFF
+    )
+    monkeypatch.setattr(planner, "PHASE_TIMED_CONDITIONS", others)
     decided_otherwise = replay(log).differences[0]
     said = {
         "show": next(p["start_s"] for p in shown if p["phase"] == "PERCH"),

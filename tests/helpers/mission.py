@@ -16,7 +16,7 @@ from perchctl.mission.context import Context
 from perchctl.mission.observe import update_state_with_observation
 from perchctl.mission.phase import Severity
 from perchctl.mission.state import DescentState, HoverErrors
-from perchctl.mission.table import PHASE_CONDITIONS, PHASES
+from perchctl.mission.table import PHASE_TIMED_CONDITIONS, PHASES
 from perchctl.profile import Profile
 from perchctl.vehicle import ARMED, AUTO_ARM, CAN_FLY, FLYING, PositionSetpoint, Telemetry
 from perchctl.vision import TargetEstimate
@@ -190,10 +190,12 @@ def remembering(state: PlannerState, **changes: Any) -> PlannerState:
     condition_start_times_s = changes.pop("condition_start_times_s", None)
     if condition_start_times_s is not None:
         changes["condition_start_times_s"] = {
-            each: s for each, s in condition_start_times_s.items() if each in PHASE_CONDITIONS
+            each: s for each, s in condition_start_times_s.items() if each in PHASE_TIMED_CONDITIONS
         }
         held = {
-            each: s for each, s in condition_start_times_s.items() if each not in PHASE_CONDITIONS
+            each: s
+            for each, s in condition_start_times_s.items()
+            if each not in PHASE_TIMED_CONDITIONS
         }
         state = replace(state, belief=replace(state.belief, condition_start_times_s=held))
     if "hover_thrust" in changes:

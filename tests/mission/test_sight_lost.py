@@ -26,7 +26,10 @@ from perchctl.mission.level_descent import (
 )
 from perchctl.mission.phase import Severity
 from perchctl.mission.planner import step_mission
-from perchctl.mission.release import MAX_BRAKED_LATERAL_SPEED_MPS, ONBOARD_POSITION_GAIN_PER_S
+from perchctl.mission.release import (
+    MAX_LATERAL_SPEED_BRAKED_IN_FALL_CATCH_MPS,
+    ONBOARD_POSITION_GAIN_PER_S,
+)
 from perchctl.mission.setpoints import MIN_HELD_SETPOINT_HEIGHT_ABOVE_GROUND_M
 from perchctl.vehicle import PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import BY_TARGET as PROFILE
@@ -249,7 +252,10 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     assert isinstance(command, PositionSetpoint)
     if unknown_mps > MIN_SPEED_GAINED_IN_GUST_MPS:
         for way_m, mps in ((command.x_m, x_mps), (command.y_m, y_mps)):
-            braked_mps = max(-MAX_BRAKED_LATERAL_SPEED_MPS, min(MAX_BRAKED_LATERAL_SPEED_MPS, mps))
+            braked_mps = max(
+                -MAX_LATERAL_SPEED_BRAKED_IN_FALL_CATCH_MPS,
+                min(MAX_LATERAL_SPEED_BRAKED_IN_FALL_CATCH_MPS, mps),
+            )
             assert way_m == pytest.approx(-braked_mps / ONBOARD_POSITION_GAIN_PER_S, abs=0.02)
     else:
         assert (command.x_m, command.y_m) == (0.0, 0.0)

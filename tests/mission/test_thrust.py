@@ -26,7 +26,7 @@ from perchctl.mission.belief.contact import (
 from perchctl.mission.phase import PRE_LANDING_PHASES
 from perchctl.mission.setpoints import (
     MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M,
-    limit_setpoint_to_fence_and_height,
+    limit_setpoint_to_fence_and_height_range,
 )
 from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST, Command, PositionSetpoint
@@ -292,7 +292,7 @@ def test_no_setpoint_lies_in_the_ground(z_m: float, phase: Phase) -> None:
     state = remembering(state_in(phase), takeoff_position_m=(0.0, 0.0, GROUND_Z_M))
     c = context_at(state, observation(10.02), PROFILE)
     lowest = GROUND_Z_M + (0.0 if phase is Phase.APPROACH else MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M)
-    sent = limit_setpoint_to_fence_and_height(c, PositionSetpoint(0.0, 0.0, z_m, 0.0)).z_m
+    sent = limit_setpoint_to_fence_and_height_range(c, PositionSetpoint(0.0, 0.0, z_m, 0.0)).z_m
     assert sent >= lowest
     assert sent == z_m or z_m < lowest or z_m > GROUND_Z_M + PROFILE.safety.max_height_m
 

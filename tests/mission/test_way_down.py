@@ -27,7 +27,7 @@ from perchctl.mission.descent import (
     make_onboard_landing_command,
 )
 from perchctl.mission.planner import step_mission
-from perchctl.mission.release import EXTRA_HANGING_TIME_IF_THRUST_UNCONFIRMED_S
+from perchctl.mission.release import EXTRA_HANGING_DWELL_IF_THRUST_UNCONFIRMED_S
 from perchctl.mission.table import TABLE
 from perchctl.vehicle import (
     CRASHED,
@@ -148,7 +148,7 @@ def on_the_ceiling(seen: list[Observation]) -> bool:
     hang_s = PROFILE.planner.complete.hang_s
     recent, longer = (
         _was_fresh(seen, hang_s),
-        _was_fresh(seen, hang_s + EXTRA_HANGING_TIME_IF_THRUST_UNCONFIRMED_S),
+        _was_fresh(seen, hang_s + EXTRA_HANGING_DWELL_IF_THRUST_UNCONFIRMED_S),
     )
     if longer is not None and all(_at_rest(o) for o in longer):
         return True

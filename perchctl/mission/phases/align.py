@@ -81,7 +81,7 @@ def planned_hover_height_above_ground_m(c: Context) -> float | None:
     )
 
 
-def is_hover_height_unsafe(c: Context) -> bool:
+def is_planned_hover_height_unsafe(c: Context) -> bool:
     """True if the vehicle is aligned and would hover lower than
     `MIN_HELD_SETPOINT_HEIGHT_ABOVE_GROUND_M` above the ground, or higher than `safety.max_height_m`
     minus `HOVER_HEIGHT_TOLERANCE_M`. False if the mission does not hover."""
@@ -137,7 +137,7 @@ ALIGN = PhaseDefinition(
         land_row(
             "hover-height",
             {Phase.ALIGN},
-            is_hover_height_unsafe,
+            is_planned_hover_height_unsafe,
             unsafe_hover_height_reason,
         ),
         land_row(

@@ -29,7 +29,7 @@ from perchctl.mission.setpoints import (
 from perchctl.mission.transition import Transition, back_off_row
 from perchctl.vehicle import RawThrust
 
-LATERAL_SPEED_EXCEEDS_DRAUGHT_DWELL_S = 0.04
+KNOCKED_ASIDE_DWELL_S = 0.04
 """Time for which the vehicle must move laterally faster than any draught can move it before the
 attempt ends, s: more than one telemetry sample."""
 MAX_PRESS_DURATION_WITHOUT_SIGHTING_S = 1.25
@@ -107,9 +107,7 @@ PERCH = PhaseDefinition(
         back_off_row(
             "knocked-aside",
             {Phase.PERCH},
-            lambda c: (
-                c.true_for_s(LATERAL_SPEED_EXCEEDS_DRAUGHT) >= LATERAL_SPEED_EXCEEDS_DRAUGHT_DWELL_S
-            ),
+            lambda c: c.true_for_s(LATERAL_SPEED_EXCEEDS_DRAUGHT) >= KNOCKED_ASIDE_DWELL_S,
             "pushed sideways under the target",
         ),
         back_off_row(

@@ -44,7 +44,7 @@ MAX_SIGHTING_AGE_TO_FOLLOW_TARGET_S = 3.0
 """Largest age of a sighting at which the vehicle still follows the target, s."""
 RECOVERY_DURATION_AFTER_LAST_ATTEMPT_S = 0.5
 """Time for which the vehicle recovers before the last failed attempt ends the flight, s."""
-RECOVERY_SETPOINT_SINK_RATE_MPS = 10.0
+UNLIMITED_SETPOINT_SINK_RATE_MPS = 10.0
 """Downward speed of the setpoint, m/s: so high that the setpoint reaches its goal at once."""
 
 STEADY_AFTER_ATTEMPT = Condition[Context](
@@ -151,7 +151,7 @@ def act_in_recover(c: Context) -> Action:
         goal = replace(setpoint, z_m=z)
     c = Context(replace(state, setpoint=setpoint))
     return fly_to(
-        c, step_setpoint_towards(c, setpoint, goal, max_down_mps=RECOVERY_SETPOINT_SINK_RATE_MPS)
+        c, step_setpoint_towards(c, setpoint, goal, max_down_mps=UNLIMITED_SETPOINT_SINK_RATE_MPS)
     )
 
 
