@@ -153,9 +153,10 @@ landed, m."""
 def step_landing(
     state: PlannerState | None, obs: Observation, profile: Profile
 ) -> tuple[PlannerState, Command]:
-    """Fly one tick of the descent without the mission's transition table. The watchdog calls this
-    function when the loop has stopped responding, and the rescue calls it after an exception. The
-    first call begins the landing. `state` is None if the planner has not run yet."""
+    """Return the planner's new state and the command for one tick of the landing, without the
+    mission's transition table. The watchdog calls this function when the loop has stopped
+    responding, and the rescue calls it after an exception. If `state` is not in the phase LANDING
+    yet, the landing begins. `state` is None if the planner has not run yet."""
     state = state or PlannerState.initial_on_ground(obs, profile)
     state = replace(state, belief=state.belief.with_observation(obs, profile))
     state = update_state_with_observation(begin_landing(state), obs, profile, DESCENT_MANEUVER)
@@ -163,8 +164,9 @@ def step_landing(
 
 
 def record_command(state: PlannerState, command: Command) -> tuple[PlannerState, Command]:
-    """Store in the state what later ticks need to know about `command` (raw thrust, time, end of
-    the thrust check), and return both as the result of the tick."""
+    """Return the result of a tick: the state, in which the time of the tick and the commanded raw
+    thrust (None for any command other than raw thrust or `Idle`) are stored for later ticks, and
+    `command` itself."""
     order = state.commanded_raw_thrust
     if not isinstance(command, Idle):
         order = command.thrust if isinstance(command, RawThrust) else None
@@ -194,8 +196,8 @@ def begin_landing(state: PlannerState) -> PlannerState:
 
 
 def enter_descent(state: PlannerState, previous_state: PlannerState) -> PlannerState:
-    """Return the state at the start of a descent; `previous_state` is the state before the
-    transition.
+    """Return the state at the start of a descent. `state` is the state after the transition to the
+    new phase, and `previous_state` the state before it.
 
     If the vehicle is hovering in place, the setpoint moves to its position. The hover thrust is
     estimated for the descent. A landing that the firmware is already executing counts as commanded,
@@ -275,16 +277,20 @@ def act_in_landing(c: Context) -> Action:
 
 
 def descend(c: Context) -> Action:
-    """Descend by one of four policies.
+    """Return the new state and command of the first of these policies that applies:
 
-    - Level, by raw thrust: without a position. With the target as the positioning system, this
-      policy also applies below `landing.handover_m`, because the firmware's own landing would
-      follow the camera's estimate to a floor of unknown height.
-    - Peel off: within the magnet's reach, lower the setpoint until the vehicle comes off. If the
-      vehicle does not come off, transfer its weight to the magnet.
-    - By setpoints: with a position, down to `landing.handover_m`.
-    - The firmware's own landing: below `landing.handover_m`, or at once if height, telemetry or
-      loop is unreliable.
+    - By raw thrust, held level, without a usable position.
+    - Peel off the magnet, if the vehicle may be within its reach: lower the setpoint until the
+      vehicle comes off, or transfer its weight to the magnet after `PEEL_OFF_MAGNET_TIMEOUT_S`.
+    - With the target as the position source, by setpoints down to `landing.handover_m`, and by raw
+      thrust below it: the firmware's own landing would follow the camera's estimate to a floor of
+      unknown height.
+    - The firmware's own landing, below `landing.handover_m`, after `landing.setpoint_time_s` in the
+      phase, or if height, telemetry or loop is unreliable.
+    - By setpoints, otherwise.
+
+    A press that has not ended is ended first if the target is the position source, or if the
+    vehicle is out of the magnet's reach and its flight data are reliable.
     """
     b = c.belief
     if not b.can_descend_under_position_control:
@@ -499,11 +505,17 @@ def make_onboard_landing_command(
 
 
 def _command_onboard_landing(c: Context) -> Action:
-    """Send the command for the firmware's own landing until the telemetry shows that the vehicle is
-    executing it. Extend a landing whose trajectory would end in the air, where the firmware would
-    stop the motors: if the vehicle is still flying below the estimated ground, the estimated height
-    has drifted, or the ground is lower here; if it is still above the ground just before the end,
-    it floats in its ground effect with too little thrust to follow."""
+    """Send the command for the firmware's own landing, and repeat it every
+    `LANDING_COMMAND_PERIOD_S`, at most `MAX_LANDING_COMMAND_COUNT` times in all, until the
+    telemetry shows that the firmware is executing it. Send `Idle` in all other ticks. A press that
+    has not ended may have to end before.
+
+    The firmware stops the motors at the end of its trajectory. If that would happen in the air, one
+    setpoint ends the trajectory, and a new landing is commanded. There are two such cases. A
+    vehicle that is still flying below the estimated ground shows that the estimated height has
+    drifted or that the ground is lower here. A vehicle that is still above the ground just before
+    the end floats in its ground effect, with too little thrust to follow the trajectory.
+    """
     tel, b = c.telemetry, c.belief
     state, away = end_press(c)
     if (
@@ -580,8 +592,8 @@ def _command_onboard_landing(c: Context) -> Action:
 
 
 def _transfer_weight_to_magnet(c: Context) -> Action:
-    """Reduce the thrust until the magnet carries the vehicle, by raw thrust. The telemetry may be
-    up to `safety.telemetry_hold_s` old, which is older than in a perch."""
+    """Reduce raw thrust until the magnet carries the vehicle. Telemetry with an age up to
+    `safety.telemetry_hold_s` is accepted; during a perch, only fresh telemetry is."""
     return transfer_weight_by_raw_thrust(c, max_stale_telemetry_age_s=c.safety.telemetry_hold_s)
 
 

@@ -179,11 +179,15 @@ def _climb_rate_measurement_age_s(c: Context) -> float:
 
 
 def should_begin_descent_with_setpoints(c: Context) -> bool:
-    """True if, before the first command of raw thrust, the telemetry is old and the hover thrust is
-    not known well enough for a descent by raw thrust; in that case, the vehicle descends by
-    setpoints, for at most `MAX_DURATION_OF_DESCENT_BY_SETPOINTS_S`. A climb rate from pictures is
-    no substitute: it is a quarter of a second late, in which a vehicle with 15 % too little thrust
-    gains 0.4 m/s."""
+    """True if the vehicle should descend by setpoints at first, because the telemetry is old and
+    the hover thrust is not known well enough for raw thrust. This applies only before the first
+    command of raw thrust, and for at most `MAX_DURATION_OF_DESCENT_BY_SETPOINTS_S`.
+
+    A climb rate from pictures does not make raw thrust safe: it is a quarter of a second late, in
+    which a vehicle with 15 % too little thrust gains 0.4 m/s. The result is nevertheless False if
+    pictures determine the motion and the state estimate has diverged or lost its heading, because
+    setpoints follow the wrong estimate.
+    """
     begins_rough = (
         c.state.descent.last_commanded_raw_thrust == 0.0
         and c.belief.hover_thrust_estimate.is_imprecise
@@ -201,10 +205,11 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
     proportional controller of the sink rate sets the thrust, and a small tilt brakes the lateral
     speed and balances the wind.
 
-    While the vehicle is not sinking, is supported, should have landed by now, or has detected the
-    floor, the thrust falls steadily instead, down to `MIN_COMMANDED_TO_HOVER_THRUST_RATIO` of the
-    hover thrust, until the magnet lets go or the vehicle stands on the floor. The motors are
-    stopped elsewhere.
+    While the vehicle is not sinking, is supported, or should have landed by now, the thrust falls
+    steadily instead, down to `MIN_COMMANDED_TO_HOVER_THRUST_RATIO` of the hover thrust, until the
+    magnet lets go or the vehicle stands on the floor. After the floor is detected, the thrust is
+    `TOUCHDOWN_TO_HOVER_THRUST_RATIO` of the hover thrust for `TOUCHDOWN_THRUST_DURATION_S`, and
+    then falls in the same way. This function does not stop the motors.
     """
     state, descent, tel, b = c.state, c.state.descent, c.telemetry, c.belief
     dt_s, age_s, measured_s = (
@@ -337,15 +342,17 @@ def _find_floor_detection_time_s(
 def _compute_thrust_for_sink_rate(
     c: Context, hover_thrust: float, climb_mps: float, height_m: float
 ) -> float:
-    """Return the thrust of the proportional sink-rate controller, 0..65535 but not yet limited:
+    """Return the raw thrust (full thrust is 65535) of the proportional sink-rate controller, before
+    it is clamped:
 
         thrust = hover_thrust * (1 - k * (climb_mps + s)) / cos(tilt)
 
-    `climb_mps` is the climb rate, positive upwards, including the change that recent commands cause
-    but no measurement shows yet. The sink rate setpoint s, m/s, is smaller below
-    `MAX_NEAR_FLOOR_HEIGHT_M`, or if `height_m` (above the ground) may be wrong, or if the climb
-    rate comes from pictures. The gain k falls with the age of the measured climb rate. The cosine
-    is at least `MIN_TILT_COSINE_IN_THRUST_COMPENSATION`.
+    `hover_thrust` is the raw thrust that carries the weight. `climb_mps` is the climb rate,
+    positive upwards, including the change that recent commands cause but no measurement shows yet.
+    The sink rate setpoint s, m/s, is smaller if `height_m` (above the ground) is at most
+    `MAX_NEAR_FLOOR_HEIGHT_M` or may be wrong, or if the climb rate comes from pictures. The gain k,
+    hover thrusts per m/s, falls with the age of the measured climb rate. The cosine is at least
+    `MIN_TILT_COSINE_IN_THRUST_COMPENSATION`.
     """
     b = c.belief
     # Late pictures, and positions that have diverged, may place the floor half a metre too low.

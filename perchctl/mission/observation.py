@@ -36,7 +36,16 @@ class VisualInertialMotion:
 class Observation:
     """The planner's input in one tick: the newest telemetry, the target estimate, problems of
     camera, link and log, the operator's request, and the motion from the IMU. Times are on the
-    loop's clock; ages are in seconds."""
+    loop's clock; ages are in seconds. A problem or reason is a sentence, or None if there is none.
+
+    `has_new_frame` is True if a good frame was processed in this tick. `heading_jump_rad` is the
+    step of the estimated heading beyond any possible rotation, at least 0.
+    `successive_marker_conflicts` counts the frames in a row in which the two markers contradict
+    each other. `climb_withheld_reason` says why the fleet's parent process does not permit the
+    climb, and `target_refusal_reason` why the last target in view was taken for another vehicle's.
+    `rejected_sighting_to_estimate_distance_m` is the distance from the estimated position to the
+    position of the newest sighting; 0 if that sighting was accepted.
+    """
 
     t_s: float
     telemetry: Telemetry  #: newest sample; its age is `t_s - telemetry.t_s`

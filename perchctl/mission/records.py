@@ -36,8 +36,18 @@ class EventKind(Enum):
 @dataclass(frozen=True)
 class Event:
     """An event of the flight, for its log and the displays: a time on the loop's clock, a kind, and
-    a reason in words. An example is the transition from ASCEND to RECOVER, with the name of the row
-    that caused it."""
+    a reason in words. An example is the transition from ASCEND to RECOVER.
+
+    Attributes:
+        phase: the phase that was entered or, for events other than `PHASE`, the present phase; None
+            if it is not known.
+        transition_name: name of the row of the transition table that caused the event; empty if
+            none did.
+        severity: severity of the flight after that transition; `HOLD` for a pause.
+        simulated_fault: fault of the simulated scenario that caused the event; empty if none did.
+        rest_state: rest state of the vehicle that a rescue found; None in all other events.
+        diagnosis: the transition's diagnosis of the vehicle.
+    """
 
     t_s: float
     kind: EventKind
@@ -123,7 +133,8 @@ class SentCommand:
 @dataclass(frozen=True)
 class ExternalPositionStatus:
     """The external positions sent to the vehicle: their number so far, their rate in the last
-    second, Hz, the newest one with the time since its exposure, s, and why none is sent now."""
+    second, Hz, the newest one (None before the first), the time since its exposure, s, and the
+    problem because of which none is sent now (None while they are sent)."""
 
     newest_position_age_s: float  # age of the newest position
     problem: str | None  # why none is sent now
@@ -135,7 +146,9 @@ class ExternalPositionStatus:
 @dataclass(frozen=True)
 class FrameRecord:
     """A `perchctl.vision.Frame` from the camera, without its picture: index, times of exposure
-    (`t_s`) and arrival on the loop's clock, and a checksum of the picture."""
+    (`t_s`) and arrival on the loop's clock, the kind of picture (whole, interlaced, or one of its
+    two fields), whether the frame repeats the previous picture, and a checksum of the picture (None
+    if it was not searched or not recorded)."""
 
     index: int
     t_s: float
@@ -148,8 +161,18 @@ class FrameRecord:
 
 @dataclass(frozen=True)
 class TickInputs:
-    """The inputs of one tick: the telemetry samples from the link, the frame from the camera, and
-    whether its sightings are used as external positions."""
+    """The inputs of one tick, from link and camera.
+
+    Attributes:
+        samples: telemetry samples in the order of arrival.
+        late_samples: samples that arrived while camera or vision blocked the tick.
+        frame: the new frame; None if none arrived.
+        camera_problem, has_camera_source_ended, is_camera_source_live: as reported by the camera
+            source; a recording ends and is not live.
+        is_detection_requested: the frame was meant to be searched for markers.
+        sends_sightings_as_position: sightings are sent to the vehicle as external positions.
+        has_discarded_sightings: earlier sightings were discarded because positions had diverged.
+    """
 
     samples: tuple[Telemetry, ...] = ()  # in the order of arrival
     late_samples: tuple[Telemetry, ...] = ()  # arrived while camera or vision blocked the loop
@@ -166,9 +189,9 @@ class TickInputs:
 
 @dataclass(frozen=True, eq=False)
 class UnfilteredPose:
-    """An unfiltered pose of the target: `t_s` and `e_m` of a `perchctl.vision.MarkerPose` (exposure
-    time, and vector from the gear to the target in the level frame, m), and its `e_yaw_rad`, the
-    target's heading relative to the vehicle's, rad, positive counter-clockwise from above."""
+    """The pose of the target in one picture, without a filter: exposure time, vector (3,) from the
+    gear to the target in the level frame (ahead, left, up), m, and the target's heading relative to
+    the vehicle's, rad, positive counter-clockwise from above."""
 
     t_s: float
     gear_to_target_level_m: Array
@@ -180,7 +203,8 @@ class TickRecord:
     """One tick of the loop, complete and exact: its inputs and its decision. A log stores it as a
     record of kind ``turn``.
 
-    `role` is one of
+    `began_s` is the time on the loop's clock at which the tick began, and `t_s` that of its
+    decision, which is later if camera or vision blocked the loop. `role` is one of
 
     - ``waiting``: before take-off;
     - ``flown``: the command was sent;
@@ -188,7 +212,8 @@ class TickRecord:
       in the next tick;
     - ``failed``: the planner raised an exception.
 
-    The fields `phase` to `reason` show the planner's state after its decision.
+    The fields `phase` to `reason` show the planner's state after its decision. `observation` and
+    `command` are None while waiting; `command` is also None in a failed tick.
     """
 
     number: int  # counts from 0; a gap is a missing tick

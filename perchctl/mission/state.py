@@ -101,9 +101,14 @@ class HoverErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class PhaseEntry:
-    """How the present phase was entered: time on the loop's clock, s; the vehicle's estimated
+    """How the present phase was entered: the time on the loop's clock, s; the vehicle's estimated
     position, m, and heading, rad, in the world at that time; and the transition's name, its reason
-    in words, its diagnosis, and the stop command that it sends at once, if any."""
+    in words, its diagnosis, and the stop command that it sends at once, if any.
+
+    The position is the reference for the phase's motion, so it moves with a jump of the estimate's
+    world frame. A search replaces position and heading by those of the last setpoint, and a phase
+    that catches a fall replaces the position.
+    """
 
     t_s: float = 0.0
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # estimated position of the vehicle
@@ -119,7 +124,16 @@ class PlannerState:
     """The planner's whole state between two ticks: its belief, the present phase and how it was
     entered, the setpoint and last commands, the number of failed attempts, and the outcome (None
     until one is decided). Times are on the loop's clock; positions are in the world frame of the
-    state estimate."""
+    state estimate.
+
+    `severity` is that of the last transition, but never falls once it is `LAND` or higher.
+    `must_end_press` is True if the phase began with the vehicle pressed at high thrust and the
+    press has not ended yet. `integral_setpoint_shift_xy_m` is the lateral integral, in world
+    axes, that is added to the setpoint. `catch_setpoint_height_above_vehicle_m` is None unless a
+    fall is being caught. `hold_reason` says why the vehicle holds its position, and
+    `waiting_reason` why a row of the transition table keeps the mission in its phase; both are
+    empty otherwise.
+    """
 
     belief: Belief
     phase: Phase = Phase.APPROACH
@@ -178,9 +192,10 @@ class PlannerState:
         return self.weight_transfer_began_at_s is None and self.motor_stop_commanded_at_s is None
 
     def command_history(self, maneuver: Maneuver) -> CommandHistory:
-        """Return the present setpoint and thrust, and the times of the decisions that the belief
-        needs to interpret its evidence, such as the start of the weight transfer. `maneuver` is the
-        maneuver of the present phase."""
+        """Return what the belief may know of the planner: the present setpoint and raw thrust, the
+        position at which the phase began, and the times at which the weight transfer began, the
+        motor stop was commanded and the floor was detected. `maneuver` is the maneuver of the
+        present phase."""
         return CommandHistory(
             maneuver=maneuver,
             maneuver_start_position_m=self.entry.position_m,

@@ -126,11 +126,23 @@ ZERO_SUMS = NormalEquationSums()
 
 @dataclass(frozen=True)
 class BatteryFit:
-    """State of the battery fit after the newest reading.
+    """State of the battery fit after the newest reading. The fit determines two unknowns: the
+    voltage sag at full thrust, V, and the true discharge rate divided by the rate calculated from
+    the assumed current.
 
-    The fit has two unknowns: the voltage sag at full thrust, V, and the true discharge rate divided
-    by the rate calculated from the assumed current. Charges are fractions of the full charge;
-    thrusts are fractions of full thrust.
+    Attributes:
+        takeoff_rest_v: resting voltage (without load) before take-off, estimated if the first
+            reading was under load; None while unknown.
+        coulomb_counted_discharge_fraction: charge consumed so far by the assumed current, as a
+            fraction of the full charge.
+        lagged_thrust_fraction: thrust, as a fraction of full thrust, delayed by a low-pass filter
+            like the voltage reading.
+        mean_airborne_thrust_fraction: mean thrust over the last seconds in the air, as a fraction
+            of full thrust.
+        rest_v: estimated resting voltage now; None while unknown.
+        time_under_load_s: total time covered by readings under load.
+        time_since_battery_reading_s: time since the last reading.
+        normal_equation_sums: sums of the least-squares fit.
     """
 
     # resting voltage before take-off, estimated if the first reading was under load
@@ -377,7 +389,8 @@ def _add_voltage_reading_to_sums(
 def full_thrust_discharge_fraction_per_s(
     battery_capacity_mah: float, power_train: PowerTrain
 ) -> float:
-    """Return the fraction of the full charge that one second of full thrust consumes."""
+    """Return the fraction of the full charge, `battery_capacity_mah`, that one second of full
+    thrust consumes, from the assumed current of the power train."""
     return power_train.full_thrust_current_a / (3.6 * battery_capacity_mah)
 
 

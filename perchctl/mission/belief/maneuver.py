@@ -56,7 +56,10 @@ class CommandHistory:
     """The commands that the planner has sent so far. The belief knows nothing else about the
     planner.
 
-    Times are on the loop's clock; positions are in the world frame of the state estimate.
+    Times are on the loop's clock, and None until the command or event has happened; positions are
+    in the world frame of the state estimate. `setpoint` is None if none applies, and
+    `commanded_raw_thrust` (0..65535) is None in position mode. `floor_detected_at_s` is the time at
+    which a descent by raw thrust detected the floor.
     """
 
     maneuver: Maneuver

@@ -101,7 +101,19 @@ def make_camera_mounting_sample(
 class CameraMountingMonitor:
     """The sightings of the last `CAMERA_MOUNTING_CHECK_WINDOW_S`, and whether they contradict or
     confirm the camera's mounting in the profile: with the right mounting, the target is stationary
-    in the world."""
+    in the world.
+
+    Attributes:
+        sightings: one sample for each frame that measured the target, oldest first.
+        check_paused_until_s: loop time until which new sightings are ignored after a jump.
+        is_camera_mounting_confirmed: the target stayed in place while the vehicle's upward axis
+            moved by at least `MIN_UP_AXIS_MOTION_TO_CONFIRM_MOUNTING_M`; the check is complete.
+        is_target_stationary: the present sightings show a stationary target.
+        contradicting_sighting_count: number of successive sightings, up to the newest one, that
+            contradict the mounting.
+        camera_yaw_error_rad: rotation of the mounting about the vehicle's upward axis with which
+            the target would be stationary, rad; 0 until a sighting contradicts the mounting.
+    """
 
     sightings: tuple[CameraMountingSample, ...] = ()
     check_paused_until_s: float = -math.inf

@@ -115,9 +115,10 @@ def hold_reason(b: Belief, maneuver: Maneuver) -> str:
 
 
 def position_loss_text(b: Belief) -> str:
-    """Return a message that says for how long no external position has been sent or, with decks, no
-    measurement has corrected the estimate, and why. While an impact or gust is uncorrected, the
-    message says this instead."""
+    """Return a message such as "no position for 1.2 s: ...": for how long no external position has
+    been sent or, with decks, no measurement has corrected the estimate, and the reason if it is
+    known. After a sideways push that no position has corrected yet, the message says this
+    instead."""
     if b.is_estimate_missing_gust:
         return "pushed sideways while the target was out of view"
     age_s, why = b.position_correction_age_s, b.obs.external_position_problem
@@ -148,5 +149,6 @@ def excessive_variance_text(b: Belief) -> str:
 
 
 def no_picture_reason(b: Belief) -> str:
-    """Return why there is no picture, or how long there has been none."""
+    """Return the camera's problem or, if none is known, a message that says for how long no good
+    picture has arrived."""
     return b.obs.camera_problem or f"no picture for {b.obs.last_good_frame_age_s:.1f} s"

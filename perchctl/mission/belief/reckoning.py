@@ -99,11 +99,38 @@ MAX_HEIGHT_INTEGRATION_STEP_S = 0.5
 
 @dataclass(frozen=True)
 class DeadReckoning:
-    """Velocity of the vehicle (world axes), horizontal vector from its gear to the target (world x
-    and y), and distance of the gear below the target, integrated from the accelerometer since the
-    last good position or sighting; and the biases of acceleration and estimated velocity that were
-    learned before. While the vector is unknown, its standard deviation is infinite. While the
-    distance is unknown, it is infinite itself."""
+    """Velocity of the vehicle and its position relative to the target, integrated from the
+    accelerometer since the last good position or sighting, with the biases learned before.
+
+    Attributes:
+        imu_at_last_update: IMU motion up to which the values are integrated; None before the first
+            sample.
+        velocity_world_mps, estimated_velocity_world_mps: dead-reckoned velocity, and the velocity
+            of the state estimate in the newest sample.
+        acceleration_bias_world_mps2: combined error of accelerometer and attitude.
+        mean_specific_force_world_xy_mps2: mean lateral reading of the accelerometer.
+        recent_estimate_minus_imu_velocity_world_xy_mps: lateral velocity that the state estimate
+            has gained recently but the accelerometer has not measured.
+        recent_imu_minus_estimate_velocity_world_xy_mps: lateral velocity that the accelerometer has
+            measured recently but the state estimate has not gained.
+        gear_below_target_m: distance of the gear below the target; infinite if the target has not
+            been seen or the vehicle has fallen since.
+        gear_below_target_lower_bound_m: the same, reduced by the highest climb that was possible
+            during gaps in the telemetry, and not reset by a fall.
+        last_gap_in_which_magnet_may_attach_ended_at_s: end of the newest gap in the telemetry after
+            which the gear may be within the magnet's reach.
+        gear_to_target_world_xy_m: horizontal vector from the gear to the target.
+        gear_to_target_sigma_m: its standard deviation per axis; infinite while unknown.
+        last_sighting_at_s: exposure time of the sighting from which the vector is integrated.
+        unexplained_position_step_sum_world_xy_m: sum of the steps of the estimated position since
+            that sighting that the estimated velocity does not explain.
+        climb_before_impact_mps: vertical speed just before the newest impact, positive up.
+        estimated_velocity_bias_world_xy_mps: lateral error of the state estimate's velocity.
+        mean_estimated_velocity_world_xy_mps, mean_estimated_position_world_xy_m: low-pass filtered
+            state estimate, from which that error is learned; the position is None until the filters
+            have restarted.
+        time_under_position_control_s: total time in free air under position control.
+    """
 
     imu_at_last_update: ImuMotion | None = None  # IMU motion up to which this value is integrated
     velocity_world_mps: Vector = ZERO_VECTOR
@@ -158,12 +185,12 @@ def advance_dead_reckoning(
     - `is_estimate_trusted`: pull the reckoned velocity towards the sample's estimated velocity, or
       adopt it at a restart, and learn from it the bias of the acceleration, which is due to
       accelerometer and attitude.
-    - `is_estimated_velocity_being_corrected`: positions have corrected the estimated velocity
-      recently.
+    - `is_estimated_velocity_being_corrected`: external positions still correct the estimated
+      velocity, so gradually forget the lateral velocity that only the accelerometer has measured.
     - `ignores_lateral_estimate`: use only the vertical part of the estimated velocity, because the
       firmware's estimator does not see a lateral push until a position corrects it.
-    - `is_position_diverged`: the estimated velocity may be in the wrong axes, so keep the reckoned
-      velocity, even after a gap in the telemetry.
+    - `is_position_diverged`: at a restart, keep the reckoned velocity instead of the estimated
+      velocity, which may be in the wrong axes.
     """
     estimated_velocity_world_mps, impact = sample.velocity_mps, imu.newest_impact
     if old.imu_at_last_update is not None and impact.t_s > old.imu_at_last_update.newest_impact.t_s:
@@ -519,12 +546,14 @@ def correct_acceleration_bias_for_wrong_positions(old: DeadReckoning) -> DeadRec
 def accumulate_unexplained_position_step(
     old: DeadReckoning, previous_sample: Telemetry, sample: Telemetry
 ) -> DeadReckoning:
-    """Return the dead reckoning with one more lateral step of the estimated position added to their
-    sum, which makes the offset at a contact less certain. A step is the motion from
-    `previous_sample` to `sample` beyond what the estimated velocity explains. Steps below a
-    threshold that grows with the time between the samples are ignored. If more than
-    `MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S` lies between the samples, no step is added, because
-    the step may be the vehicle's motion."""
+    """Return the dead reckoning after adding an unexplained step of the estimated position, if
+    there was one, to the sum of such steps. Their sum makes the offset at a contact less certain.
+
+    The step (world x and y) is the motion of the estimated position from `previous_sample` to
+    `sample`, minus the mean of the two estimated velocities times the time. It is ignored below a
+    threshold that grows with the time between the samples, and if this time is more than
+    `MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S`, because it may then be the vehicle's motion.
+    """
     dt_s = _position_timestamp_s(sample) - _position_timestamp_s(previous_sample)
     if not 0.0 < dt_s <= MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S:
         return old
@@ -561,10 +590,10 @@ def restart_dead_reckoning_at_sighting(
     gear_below_target_m: float,
     sigma_m: float,
 ) -> DeadReckoning:
-    """Return the dead reckoning whose offset from the target restarts at a sighting exposed at
-    `t_s`; the velocity is kept.
+    """Return the dead reckoning with its position relative to the target replaced by that of a
+    picture exposed at `t_s`; the velocity is kept.
 
-    `gear_to_target_world_xy_m` is the vector from the gear to the target (world x, y), with the
+    `gear_to_target_world_xy_m` is the horizontal vector from the gear to the target, with the
     standard deviation `sigma_m` per axis; `gear_below_target_m` is how far the gear is below the
     target.
     """

@@ -153,8 +153,9 @@ def reset_phase_dependent_conditions(b: Belief) -> Belief:
 
 
 def update_thrust_check_after_command(b: Belief, command: Command) -> Belief:
-    """Return the belief after a command was sent. Any command other than raw thrust or idle ends
-    the check that the reported thrust follows the commanded raw thrust."""
+    """Return the belief after `command` was sent. The check that the reported thrust follows the
+    commanded raw thrust continues after a raw thrust or an `Idle`, and ends after any other
+    command."""
     if isinstance(command, (RawThrust, Idle)):
         return b
     return replace(b, thrust_began_to_differ_from_command_at_s=None)
@@ -164,8 +165,9 @@ def update_thrust_check_after_command(b: Belief, command: Command) -> Belief:
 
 
 def _update_target(b: Belief) -> Belief:
-    """Return the belief with the target's position, the scatter of its recent measured positions,
-    and the vehicle's velocity from pictures, after a frame that measured the target."""
+    """Return the belief after a frame that measured the target, with the target's position in the
+    world, the scatter of its recent measured positions, m, the filtered lateral offset, and the
+    vehicle's velocity from pictures. In a tick without such a frame, the belief is unchanged."""
     target = b.obs.target
     if not b.obs.has_new_frame or target is None or not target.is_measured_in_newest_frame:
         return b
@@ -217,11 +219,14 @@ def _reset_conditions_after_tick_gap(b: Belief) -> Belief:
 
 def _shift_stored_positions_after_frame_jump(b: Belief) -> Belief:
     """Return the belief after a jump of the estimated position, which has moved the estimate's
-    world frame but not the vehicle. The stored positions (take-off, contact, start of the maneuver,
-    setpoint) move with the frame, so that they stay in place relative to the vehicle. They stay
-    unchanged, apart from the setpoint, which moves to the vehicle in any case, if samples are
-    missing before the jump, since the vehicle may have moved, or if external positions have just
-    returned and the jump ends a drift."""
+    world frame but not the vehicle.
+
+    The stored positions (take-off, height of the contact, start of the maneuver) are shifted with
+    the frame, so that they stay in place relative to the vehicle. They are not shifted if samples
+    are missing before the jump, since the vehicle itself may have moved, or if external positions
+    have just returned and the jump ends a drift. In all cases, the setpoint moves to the vehicle's
+    new position and heading; with a recorded contact, it keeps its height, shifted with the frame.
+    """
     obs, last = b.obs, b.last_telemetry
     first_estimate_jump_at_s = (
         obs.t_s if b.first_estimate_jump_at_s is None else b.first_estimate_jump_at_s
@@ -264,9 +269,11 @@ def _translate(position_m: Vector, shift_m: Vector) -> Vector:
 
 
 def _compare_thrust_with_command(b: Belief) -> Belief:
-    """Return the belief with the loop time at which the reported thrust began to differ from the
-    commanded raw thrust by more than `MAX_THRUST_DEVIATION_FROM_COMMAND_FRACTION`; None while they
-    agree."""
+    """Return the belief after comparing the reported thrust with the commanded raw thrust;
+    unchanged if no raw thrust is commanded. `thrust_began_to_differ_from_command_at_s` is the loop
+    time since which the two have differed by more than `MAX_THRUST_DEVIATION_FROM_COMMAND_FRACTION`
+    of full thrust, None while they agree. If the difference has lasted too long for the reported
+    thrust to be reliable, `thrust_last_differed_from_command_at_s` becomes the present time."""
     order = b.command_history.commanded_raw_thrust
     if order is None:
         return b
@@ -393,10 +400,9 @@ def _adopt_visual_inertial_velocity(b: Belief, new: DeadReckoning) -> DeadReckon
     agree. If that estimate is not newer than the sample at which the previous tick's dead reckoning
     ended, `new` is returned unchanged.
 
-    The climb rate is adopted if nothing better measures it: if the pictures are known to be late,
-    because they then also make the estimated height wrong, and while attitude and acceleration
-    still arrive but the estimated velocity does not. The accelerometer alone is off by a quarter of
-    a metre per second within three seconds.
+    The climb rate is adopted, if known, only in two cases: if the telemetry is old, because the
+    accelerometer alone is off by a quarter of a metre per second within three seconds; and if the
+    pictures are known to be late, because they then also make the estimated height wrong.
     """
     motion, before = b.obs.visual_inertial_motion, b.dead_reckoning.imu_at_last_update
     if motion is None or not (before is None or motion.t_s > before.t_s):
