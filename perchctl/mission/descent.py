@@ -139,7 +139,7 @@ MIN_THRUST_TO_HOVER_RATIO_IF_FLYING = 0.85
 counts as still flying. Once the vehicle is on the floor, and therefore above the end of its
 trajectory, the firmware commands its smallest thrust. Larger: a vehicle that sinks faster and
 faster counts as landed. Smaller: a vehicle that has just touched down counts as flying."""
-MAX_HEIGHT_DRIFT_IN_LANDING_GOAL_M = 1.0
+MAX_ASSUMED_HEIGHT_DRIFT_FOR_LANDING_GOAL_M = 1.0
 """Largest assumed drift of the height, m."""
 MAX_SPECIFIC_FORCE_IN_FALL_G = 0.5
 """Specific force below which the vehicle is falling, g: no floor is supporting it."""
@@ -446,7 +446,7 @@ def _descend_by_setpoints(c: Context) -> Action:
         )
     state = forget_contact_when_below(state, MIN_DISTANCE_BELOW_CONTACT_WHEN_DETACHED_M)
     state = replace(state, setpoint=setpoint, catch_setpoint_height_above_vehicle_m=None)
-    dx, dy = state.integral_setpoint_shift_xy_m
+    dx, dy = state.integral_setpoint_shift_world_xy_m
     sent = replace(setpoint, x_m=setpoint.x_m + dx, y_m=setpoint.y_m + dy)
     return state, limit_setpoint_to_fence_and_height_range(c, sent)
 
@@ -491,7 +491,7 @@ def make_onboard_landing_command(
     above the vehicle.
     """
     drifted_m = min(
-        MAX_HEIGHT_DRIFT_IN_LANDING_GOAL_M,
+        MAX_ASSUMED_HEIGHT_DRIFT_FOR_LANDING_GOAL_M,
         planner.landing.drift_mps * max(0.0, time_in_flight_s),
     )
     goal_z_m = min(ground_z_m, vehicle_world_z_m) - (planner.landing.undershoot_m + drifted_m)

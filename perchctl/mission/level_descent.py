@@ -56,13 +56,13 @@ below which it counts as not climbing, m/s; the error of single detections is ha
 BRAKE_TILT_GAIN_IF_CAMERA_GUIDED_RAD_PER_MPS = 0.15
 """Tilt per lateral speed measured from pictures, rad per m/s. Larger: the vehicle oscillates, since
 the tilt itself looks like a motion. Smaller: it drifts further."""
-SETTLING_DURATION_AT_CONSTANT_SETPOINT_S = 0.6
+SETTLING_TIME_AT_CONSTANT_SETPOINT_S = 0.6
 """Time at a constant setpoint after which the vehicle has come to rest, s."""
 THRUST_RAMP_DOWN_RATE_HOVER_FRACTION_PER_S = 0.25
 """Rate at which the thrust of a vehicle that is not sinking is reduced, as a fraction of the hover
 thrust per second. Larger: the vehicle hits the floor faster. Smaller: a magnet holds it for
 longer."""
-CAMERA_GUIDED_RAMP_DOWN_HOVER_FRACTION_PER_S = 0.1
+THRUST_RAMP_DOWN_RATE_IF_CAMERA_GUIDED_HOVER_FRACTION_PER_S = 0.1
 """Rate at which the thrust of a vehicle that is not sinking is reduced while the vertical speed
 comes from pictures, as a fraction of the hover thrust per second; pictures take a quarter of a
 second to show that the vehicle is sinking. Larger: the vehicle falls at first. Smaller: the vehicle
@@ -87,7 +87,7 @@ MAX_WIND_COMPENSATION_TILT_RAD = 0.2
 bias moves the vehicle far off course."""
 MAX_LATERAL_VELOCITY_AGE_FOR_FULL_BRAKE_S = 0.2
 """Age of the lateral speed above which the vehicle brakes less, s; otherwise it would oscillate."""
-INITIAL_LATERAL_VELOCITY_SIGMA_MPS = 0.05
+LATERAL_VELOCITY_SIGMA_AT_POSITION_LOSS_MPS = 0.05
 """Uncertainty of the lateral speed when the position is lost, m/s."""
 LATERAL_VELOCITY_SIGMA_GROWTH_MPS2 = 0.1
 """Growth of the lateral speed's uncertainty, m/s per second: an attitude error of 0.01 rad adds
@@ -230,7 +230,7 @@ def descend_level_by_raw_thrust(c: Context) -> Action:
     if _visual_motion_if_telemetry_old(c) is not None:
         may_be_held, ramp_per_s = (
             abs(measured_climb_mps) < MIN_SINK_RATE_DETECTED_BY_CAMERA_MPS,
-            CAMERA_GUIDED_RAMP_DOWN_HOVER_FRACTION_PER_S,
+            THRUST_RAMP_DOWN_RATE_IF_CAMERA_GUIDED_HOVER_FRACTION_PER_S,
         )
     hover_thrust = hover.estimate_hover_thrust(b).thrust
     height_m = b.height_m if b.dead_reckoning_began_at_s is None else b.dead_reckoned_height_m
@@ -307,7 +307,7 @@ def _last_measured_climb_mps(c: Context) -> float:
     seen = _visual_motion_if_telemetry_old(c)
     if seen is not None:
         return seen.vehicle_velocity_level_mps[2]
-    held = c.telemetry.t_s < c.state.entry.t_s - SETTLING_DURATION_AT_CONSTANT_SETPOINT_S
+    held = c.telemetry.t_s < c.state.entry.t_s - SETTLING_TIME_AT_CONSTANT_SETPOINT_S
     return 0.0 if held else c.belief.climb_mps
 
 
@@ -449,7 +449,7 @@ def _compute_braking_roll_pitch_rad(c: Context) -> tuple[float, float]:
     )
     unsure_mps = min(
         MAX_LATERAL_VELOCITY_SIGMA_MPS,
-        INITIAL_LATERAL_VELOCITY_SIGMA_MPS
+        LATERAL_VELOCITY_SIGMA_AT_POSITION_LOSS_MPS
         + LATERAL_VELOCITY_SIGMA_GROWTH_MPS2 * min(blind_s, visual_age_s),
     )
     part = max(0.0, 1.0 - unsure_mps / speed_mps)

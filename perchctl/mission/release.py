@@ -101,7 +101,7 @@ def end_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     )
     if tel.velocity_mps[2] < MAX_CLIMB_RATE_WHEN_FALLING_AFTER_PRESS_MPS:
         setpoint_below_vehicle_m = 0.0
-    dx, dy = state.integral_setpoint_shift_xy_m
+    dx, dy = state.integral_setpoint_shift_world_xy_m
     setpoint = PositionSetpoint(
         x + dx, y + dy, tel.position_m[2] - setpoint_below_vehicle_m, state.entry.yaw_rad
     )

@@ -117,13 +117,13 @@ def _find_rest_state_from_measured_falls(c: Context) -> RestState:
     floor_s = c.state.descent.floor_detected_at_s
     down_s = max(b.imu.last_fall_at_s, -math.inf if floor_s is None else floor_s)
     # a sighting resolves the doubt
-    unsure = dead_reckoning.last_gap_in_which_magnet_may_attach_ended_at_s > max(
+    unsure = dead_reckoning.last_telemetry_gap_in_magnet_reach_ended_at_s > max(
         down_s, dead_reckoning.last_sighting_at_s
     )
     if since_s is None or down_s > since_s:
         return RestState.UNKNOWN if unsure else RestState.STANDS
     came_unheard = (
-        unsure and dead_reckoning.last_gap_in_which_magnet_may_attach_ended_at_s <= since_s
+        unsure and dead_reckoning.last_telemetry_gap_in_magnet_reach_ended_at_s <= since_s
     )
     return (
         RestState.UNKNOWN

@@ -155,10 +155,12 @@ def fly_under_target(c: Context, vehicle_world_z_m: float, *, max_up_mps: float 
     does not climb. The state's lateral integral, which shifts the setpoint against a steady wind,
     is updated (`update_lateral_integral`)."""
     goal = make_setpoint_under_target(c, vehicle_world_z_m)
-    integral_setpoint_shift_xy_m = update_lateral_integral(
+    integral_setpoint_shift_world_xy_m = update_lateral_integral(
         c, (goal.x_m, goal.y_m), c.t_s - c.state.t_s
     )
-    c = Context(replace(c.state, integral_setpoint_shift_xy_m=integral_setpoint_shift_xy_m))
+    c = Context(
+        replace(c.state, integral_setpoint_shift_world_xy_m=integral_setpoint_shift_world_xy_m)
+    )
     old = c.state.setpoint or make_setpoint_at_vehicle(c)
     return fly_to(
         c,
@@ -183,7 +185,7 @@ def update_lateral_integral(
     planner = c.planner
     ex = goal_world_xy_m[0] - c.telemetry.position_m[0]
     ey = goal_world_xy_m[1] - c.telemetry.position_m[1]
-    tx, ty = c.state.integral_setpoint_shift_xy_m
+    tx, ty = c.state.integral_setpoint_shift_world_xy_m
     stands = c.belief.speed_mps < MAX_SPEED_TO_COUNT_AS_HOVERING_MPS
     most_m = (
         MAX_LATERAL_INTEGRAL_SHIFT_M
@@ -206,14 +208,14 @@ def move_setpoint_to_vehicle(c: Context) -> PlannerState:
     """
     reference, (x_m, y_m, _) = c.state.setpoint, c.telemetry.position_m
     if reference is None or c.belief.is_position_diverged:
-        return replace(c.state, integral_setpoint_shift_xy_m=(0.0, 0.0))
+        return replace(c.state, integral_setpoint_shift_world_xy_m=(0.0, 0.0))
     if not c.belief.is_position_valid or c.belief.speed_mps > MAX_SPEED_TO_COUNT_AS_HOVERING_MPS:
         return c.state
     sent = correct_setpoint(c, reference)
     return replace(
         c.state,
         setpoint=replace(reference, x_m=x_m, y_m=y_m),
-        integral_setpoint_shift_xy_m=limit_vector_length(
+        integral_setpoint_shift_world_xy_m=limit_vector_length(
             sent.x_m - x_m, sent.y_m - y_m, MAX_LATERAL_INTEGRAL_SHIFT_M
         ),
     )
@@ -247,8 +249,8 @@ def correct_setpoint(
     dx, dy = _lateral_feedback_shift_world_xy_m(c, reference)
     return replace(
         reference,
-        x_m=reference.x_m + c.state.integral_setpoint_shift_xy_m[0] + dx,
-        y_m=reference.y_m + c.state.integral_setpoint_shift_xy_m[1] + dy,
+        x_m=reference.x_m + c.state.integral_setpoint_shift_world_xy_m[0] + dx,
+        y_m=reference.y_m + c.state.integral_setpoint_shift_world_xy_m[1] + dy,
         z_m=reference.z_m + lifted,
     )
 

@@ -71,13 +71,13 @@ class HoverErrors:
     def with_error(
         self,
         t_s: float,
-        gear_to_hover_position_m: tuple[float, float, float],
+        gear_to_hover_position_level_m: tuple[float, float, float],
         vehicle_to_target_yaw_rad: float,
     ) -> HoverErrors:
         """Return the errors with those of one more frame at `t_s`: the vector from the gear to the
         hover position (forward, left, up) in the level frame, m, and the target's heading relative
         to the vehicle's, rad."""
-        errors = (*gear_to_hover_position_m, vehicle_to_target_yaw_rad)
+        errors = (*gear_to_hover_position_level_m, vehicle_to_target_yaw_rad)
         x2, y2, z2, yaw2 = (
             s + e * e for s, e in zip(self.squared_error_sums_xyz_yaw, errors, strict=True)
         )
@@ -128,7 +128,7 @@ class PlannerState:
 
     `severity` is that of the last transition, but never falls once it is `LAND` or higher.
     `must_end_press` is True if the phase began with the vehicle pressed at high thrust and the
-    press has not ended yet. `integral_setpoint_shift_xy_m` is the lateral integral, in world
+    press has not ended yet. `integral_setpoint_shift_world_xy_m` is the lateral integral, in world
     axes, that is added to the setpoint. `catch_setpoint_height_above_vehicle_m` is None unless a
     fall is being caught. `hold_reason` says why the vehicle holds its position, and
     `waiting_reason` why a row of the transition table keeps the mission in its phase; both are
@@ -150,7 +150,7 @@ class PlannerState:
     searched_position_count: int = 0
     search_step_began_at_s: float = 0.0
     setpoint: PositionSetpoint | None = None
-    integral_setpoint_shift_xy_m: tuple[float, float] = (0.0, 0.0)
+    integral_setpoint_shift_world_xy_m: tuple[float, float] = (0.0, 0.0)
     #: the phase began with the vehicle pressed at high thrust, and the press has not ended yet
     must_end_press: bool = False
     catch_setpoint_height_above_vehicle_m: float | None = None

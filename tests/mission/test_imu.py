@@ -181,7 +181,7 @@ def test_in_a_silence_only_what_had_thrust_climbs_into_the_magnet_s_reach(
         new = advance_dead_reckoning(
             old, imu.with_sample(before, after), after, is_estimate_trusted=False
         )
-        assert (new.last_gap_in_which_magnet_may_attach_ended_at_s == after.t_s) is unsure
+        assert (new.last_telemetry_gap_in_magnet_reach_ended_at_s == after.t_s) is unsure
         assert new.gear_below_target_m == (z_m if kept else math.inf)
         assert (
             restart_dead_reckoning_at_sighting(
@@ -206,7 +206,7 @@ def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring
             dead_reckoning, motion, new, is_estimate_trusted=False
         )
     assert motion.last_fall_at_s > 1.0
-    assert dead_reckoning.last_gap_in_which_magnet_may_attach_ended_at_s == late.t_s
+    assert dead_reckoning.last_telemetry_gap_in_magnet_reach_ended_at_s == late.t_s
 
 
 def estimate_only_mps(

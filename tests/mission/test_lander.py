@@ -689,7 +689,7 @@ def test_after_a_restart_only_a_new_sighting_shows_the_floor(
             NOW_S - 6.0,
             restarted,
             DeadReckoning(
-                last_gap_in_which_magnet_may_attach_ended_at_s=NOW_S + restarted_s,
+                last_telemetry_gap_in_magnet_reach_ended_at_s=NOW_S + restarted_s,
                 last_sighting_at_s=NOW_S + seen_s,
             ),
             profile=BY_TARGET if by_target else PROFILE,
@@ -728,7 +728,7 @@ def test_a_silence_that_may_have_brought_it_to_the_magnet_leaves_it_unknown(
 ) -> None:
     """Whether it counted as in reach since or not: it may have met the floor meanwhile, too. A
     sight or a floor that was felt afterwards tells."""
-    silence = DeadReckoning(last_gap_in_which_magnet_may_attach_ended_at_s=NOW_S - 3.0)
+    silence = DeadReckoning(last_telemetry_gap_in_magnet_reach_ended_at_s=NOW_S - 3.0)
     assert ended(magnet_reach_entered_at_s, dead_reckoning=silence) is RestState.UNKNOWN
     assert (
         ended(magnet_reach_entered_at_s, dead_reckoning=silence, floor_detected_at_s=NOW_S - 1.5)

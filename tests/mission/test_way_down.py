@@ -21,7 +21,7 @@ from perchctl.mission import (
 )
 from perchctl.mission.belief.contact import MOTORS_OFF_DWELL_S, TARGET_CONTACT
 from perchctl.mission.descent import (
-    MAX_HEIGHT_DRIFT_IN_LANDING_GOAL_M,
+    MAX_ASSUMED_HEIGHT_DRIFT_FOR_LANDING_GOAL_M,
     ONBOARD_LANDING_DURATION_MARGIN_S,
     ONBOARD_LANDING_PEAK_SPEED_MPS,
     make_onboard_landing_command,
@@ -646,7 +646,7 @@ def test_its_own_landing_is_slow_and_aims_lower_the_longer_the_estimate_has_drif
     is 15/8 of the mean; it begins while the vehicle sinks, which costs time that is not way."""
     config = PROFILE.planner.landing
     order = make_onboard_landing_command(PROFILE.planner, 0.0, flown_s, z_m)
-    drift_m = min(MAX_HEIGHT_DRIFT_IN_LANDING_GOAL_M, config.drift_mps * flown_s)
+    drift_m = min(MAX_ASSUMED_HEIGHT_DRIFT_FOR_LANDING_GOAL_M, config.drift_mps * flown_s)
     assert order.height_m == pytest.approx(min(0.0, z_m) - config.undershoot_m - drift_m)
     way_m = z_m - order.height_m
     assert 15 / 8 * way_m / (order.duration_s - ONBOARD_LANDING_DURATION_MARGIN_S) == pytest.approx(

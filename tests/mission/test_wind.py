@@ -81,7 +81,7 @@ def test_an_offset_in_which_the_vehicle_stands_is_trimmed(
 ) -> None:
     """The setpoint goes on to the other side of the target until the vehicle follows."""
     flight = fly(state_in(Phase.ALIGN), blown(lateral_offset_m, 0.0, towards_rad), 1.5, MOCAP)
-    x_m, y_m = flight.state.integral_setpoint_shift_xy_m
+    x_m, y_m = flight.state.integral_setpoint_shift_world_xy_m
     along_m = x_m * math.cos(towards_rad) + y_m * math.sin(towards_rad)
     gain = MOCAP.planner.integral_per_s * 1.5
     assert along_m == pytest.approx(
@@ -94,7 +94,7 @@ def test_an_offset_in_which_the_vehicle_stands_is_trimmed(
 def test_an_offset_on_the_way_is_not_trimmed(flown_mps: float) -> None:
     flight = fly(state_in(Phase.ALIGN), blown(0.3, 0.0, 0.0, flown_mps), 0.4, MOCAP)
     assert flight.state.phase is Phase.ALIGN
-    assert flight.state.integral_setpoint_shift_xy_m == (0.0, 0.0)
+    assert flight.state.integral_setpoint_shift_world_xy_m == (0.0, 0.0)
 
 
 @BRIEFLY

@@ -34,16 +34,19 @@ MIN_MOVING_TARGET_POSITION_RMS_M = 0.05
 """Smallest RMS distance of the target's estimated world positions from their mean that shows that
 the target moves, m."""
 MAX_ROTATION_FIT_RESIDUAL_TO_SPREAD_RATIO = 0.45  # fraction of the target's spread
-MIN_FITTED_ROTATION_MODULUS = 0.5  # modulus of M; near 0, the world frame drifts
+MIN_MODULUS_OF_FITTED_COMPLEX_ROTATION = 0.5  # modulus of M; near 0, the world frame drifts
 # with a smaller rotation, the vehicle still reaches the target on a curve
 MIN_DETECTED_CAMERA_YAW_ERROR_RAD = math.radians(65.0)
 MIN_CONTRADICTING_SIGHTINGS = 4
 """Number of successive contradicting sightings that prove a wrong mounting. Smaller: single wrong
 poses end the flight."""
-TARGET_JUMP_DISTANCES_M_AND_DURATIONS_S, CHECK_PAUSE_AFTER_JUMP_S = ((0.1, 0.1), (0.15, 0.2)), 0.4
-"""`TARGET_JUMP_DISTANCES_M_AND_DURATIONS_S` are pairs of a distance, m, and a time, s: a target
-that moves by more than the distance plus twice the vehicle's motion within that time has been
-moved. `CHECK_PAUSE_AFTER_JUMP_S` is the pause of the check after a jump, s."""
+TARGET_JUMP_MIN_DISTANCE_M_MAX_DURATION_S_PAIRS, CHECK_PAUSE_AFTER_JUMP_S = (
+    ((0.1, 0.1), (0.15, 0.2)),
+    0.4,
+)
+"""`TARGET_JUMP_MIN_DISTANCE_M_MAX_DURATION_S_PAIRS` are pairs of a distance, m, and a time, s: a
+target that moves by more than the distance plus twice the vehicle's motion within that time has
+been moved. `CHECK_PAUSE_AFTER_JUMP_S` is the pause of the check after a jump, s."""
 MIN_ESTIMATE_JUMP_DISTANCE_M = 0.05
 """Motion of the vehicle's estimated position between two sightings above which the state estimate
 has jumped, m; `ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS` times the time between them is added. Larger:
@@ -52,7 +55,7 @@ ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS = 1.5
 """Increase of `MIN_ESTIMATE_JUMP_DISTANCE_M` for each second between the sightings, m/s. Smaller:
 the sightings of a fast vehicle are dropped."""
 _MAX_TARGET_JUMP_DURATION_S = max(
-    within_s for _, within_s in TARGET_JUMP_DISTANCES_M_AND_DURATIONS_S
+    within_s for _, within_s in TARGET_JUMP_MIN_DISTANCE_M_MAX_DURATION_S_PAIRS
 )
 
 
@@ -189,7 +192,7 @@ def _has_target_or_estimate_jumped(
             abs(sample.target_world_xy_m - s.target_world_xy_m),
             abs(sample.up_axis_at_target_height_world_xy_m - s.up_axis_at_target_height_world_xy_m),
         )
-        for jump_m, within_s in TARGET_JUMP_DISTANCES_M_AND_DURATIONS_S:
+        for jump_m, within_s in TARGET_JUMP_MIN_DISTANCE_M_MAX_DURATION_S_PAIRS:
             if age_s <= within_s and target_m > jump_m + 2.0 * vehicle_m:
                 return True
     return False
@@ -223,7 +226,7 @@ def _judge_camera_mounting(
     turn = 1.0 - along
     if (
         abs(along) >= MIN_TARGET_TO_UP_AXIS_MOTION_RATIO_IF_MOVING
-        and abs(turn) >= MIN_FITTED_ROTATION_MODULUS
+        and abs(turn) >= MIN_MODULUS_OF_FITTED_COMPLEX_ROTATION
         and abs(cmath.phase(turn)) >= MIN_DETECTED_CAMERA_YAW_ERROR_RAD
         and spread_m >= MIN_MOVING_TARGET_POSITION_RMS_M
         and unexplained_m <= MAX_ROTATION_FIT_RESIDUAL_TO_SPREAD_RATIO * spread_m

@@ -45,7 +45,7 @@ MAX_ACCELERATION_BIAS_INNOVATION_MPS2 = 2.0
 """Largest difference between measured and estimated acceleration in one sample from which the bias
 is learned, m/s^2; a larger difference is due to an impact or a correction of the estimate. Larger:
 the effect of a 40 ms impact is learned. Smaller: a gust is not learned."""
-CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS = 0.1
+MAX_DEAD_RECKONED_CLIMB_RATE_ERROR_MPS = 0.1
 """Margin by which the vehicle may climb faster than dead reckoning says, m/s. Larger: the magnet
 seems to be in reach too early."""
 MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS = 1.0
@@ -90,7 +90,7 @@ of a contact is reported as more precise than it is."""
 POSITION_SIGMA_TO_DISTANCE_FLOWN_RATIO = 0.3
 """Fraction of the distance flown without a sighting that is added to the standard deviation of a
 dead-reckoned position."""
-BIAS_CORRECTION_PER_ESTIMATE_MINUS_IMU_VELOCITY_PER_S = 1.5
+ACCELERATION_BIAS_PER_ESTIMATE_MINUS_IMU_VELOCITY_PER_S = 1.5
 """Bias of the acceleration, m/s^2, that positions in the wrong axes cause per m/s of
 `recent_estimate_minus_imu_velocity_world_xy_mps`."""
 MAX_HEIGHT_INTEGRATION_STEP_S = 0.5
@@ -117,7 +117,7 @@ class DeadReckoning:
             been seen or the vehicle has fallen since.
         gear_below_target_lower_bound_m: the same, reduced by the highest climb that was possible
             during gaps in the telemetry, and not reset by a fall.
-        last_gap_in_which_magnet_may_attach_ended_at_s: end of the newest gap in the telemetry after
+        last_telemetry_gap_in_magnet_reach_ended_at_s: end of the newest gap in the telemetry after
             which the gear may be within the magnet's reach.
         gear_to_target_world_xy_m: horizontal vector from the gear to the target.
         gear_to_target_sigma_m: its standard deviation per axis; infinite while unknown.
@@ -148,7 +148,7 @@ class DeadReckoning:
     # increase it
     gear_below_target_lower_bound_m: float = math.inf
     # end of the newest gap after which the magnet may hold the vehicle
-    last_gap_in_which_magnet_may_attach_ended_at_s: float = -math.inf
+    last_telemetry_gap_in_magnet_reach_ended_at_s: float = -math.inf
     # lateral offset from the gear to the target's axis
     gear_to_target_world_xy_m: tuple[float, float] = (0.0, 0.0)
     # standard deviation of `gear_to_target_world_xy_m`; inf if unknown
@@ -289,7 +289,7 @@ def _restart_dead_reckoning(
             and imu.motors_stopped_at_s <= imu.t_s
         )
         flew = not (off or imu.vehicle_restarted_at_s > old.imu_at_last_update.t_s)
-        climb_mps = max(0.0, old.velocity_world_mps[2]) + CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS
+        climb_mps = max(0.0, old.velocity_world_mps[2]) + MAX_DEAD_RECKONED_CLIMB_RATE_ERROR_MPS
         climb_m = climb_mps**2 / (2.0 * GRAVITY_MPS2)
         if flew:
             climb_m = MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS * (imu.t_s - old.imu_at_last_update.t_s)
@@ -298,9 +298,9 @@ def _restart_dead_reckoning(
         unknown = replace(
             unknown,
             gear_below_target_lower_bound_m=gear_below_target_lower_bound_m,
-            last_gap_in_which_magnet_may_attach_ended_at_s=imu.t_s
+            last_telemetry_gap_in_magnet_reach_ended_at_s=imu.t_s
             if near
-            else old.last_gap_in_which_magnet_may_attach_ended_at_s,
+            else old.last_telemetry_gap_in_magnet_reach_ended_at_s,
             gear_below_target_m=old.gear_below_target_m if near or flew else math.inf,
         )
     return replace(unknown, gear_to_target_sigma_m=math.inf)
@@ -433,7 +433,7 @@ def _integrate_sample(
         recent_imu_minus_estimate_velocity_world_xy_mps=(missed[0], missed[1]),
         gear_below_target_m=math.inf
         if fell
-        else old.gear_below_target_m - (vz + CLIMB_RATE_MARGIN_FOR_MAGNET_REACH_MPS) * dt_s,
+        else old.gear_below_target_m - (vz + MAX_DEAD_RECKONED_CLIMB_RATE_ERROR_MPS) * dt_s,
         gear_below_target_lower_bound_m=old.gear_below_target_lower_bound_m - vz * dt_s,
         gear_to_target_world_xy_m=(ex - vx * dt_s, ey - vy * dt_s),
         gear_to_target_sigma_m=old.gear_to_target_sigma_m + growth_m,
@@ -528,7 +528,7 @@ def correct_acceleration_bias_for_wrong_positions(old: DeadReckoning) -> DeadRec
     """Return the dead reckoning with its lateral acceleration bias corrected after positions in the
     wrong axes. Such positions have given the state estimate a velocity that the accelerometer has
     not measured and, in proportion to it, a wrong tilt, which was learned as a bias. The correction
-    is this velocity times `BIAS_CORRECTION_PER_ESTIMATE_MINUS_IMU_VELOCITY_PER_S`."""
+    is this velocity times `ACCELERATION_BIAS_PER_ESTIMATE_MINUS_IMU_VELOCITY_PER_S`."""
     (bx, by, bz), (x_mps, y_mps) = (
         old.acceleration_bias_world_mps2,
         old.recent_estimate_minus_imu_velocity_world_xy_mps,
@@ -536,8 +536,8 @@ def correct_acceleration_bias_for_wrong_positions(old: DeadReckoning) -> DeadRec
     return replace(
         old,
         acceleration_bias_world_mps2=(
-            bx + BIAS_CORRECTION_PER_ESTIMATE_MINUS_IMU_VELOCITY_PER_S * x_mps,
-            by + BIAS_CORRECTION_PER_ESTIMATE_MINUS_IMU_VELOCITY_PER_S * y_mps,
+            bx + ACCELERATION_BIAS_PER_ESTIMATE_MINUS_IMU_VELOCITY_PER_S * x_mps,
+            by + ACCELERATION_BIAS_PER_ESTIMATE_MINUS_IMU_VELOCITY_PER_S * y_mps,
             bz,
         ),
     )
