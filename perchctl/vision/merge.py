@@ -39,8 +39,9 @@ _VISIBLE_MARKERS_BY_POSE_SOURCE = {
 
 @dataclass(frozen=True, eq=False)
 class MergedTarget:
-    """The target in the tracks' frame: relative to the gear in level axes, or in the world of the
-    state estimate.
+    """The target's position, yaw and velocity, merged from the tracks of its markers. All are in
+    the frame of the tracks: relative to the gear in level axes, or in the world frame of the state
+    estimate.
 
     Attributes:
         track_frame_xyz_yaw: position and yaw of the target (4,), m and rad.
@@ -74,8 +75,9 @@ def estimate_marker_poses(
     """Estimate the poses of the markers detected in one frame, and assign them to the tracks that
     they update: a single track ``joint``, or one track for each marker, depending on
     `config.method`. If the two markers contradict each other, only the more certain pose updates a
-    track. If `config.stages` is ``range`` instead of ``seen``, the distance to the target's plane
-    decides which of the two markers are used.
+    track. Otherwise, if both are detected and `config.stages` is ``range``, the distance from the
+    camera to the target's plane decides whether the large marker, the small one or both are used.
+    If it is ``seen``, all detected markers are used.
 
     `attitude` is the vehicle's attitude at the time of the frame (None if unknown). `start_pose` is
     the last pose of the target in the camera frame, corrected for the vehicle's motion since then
@@ -128,10 +130,11 @@ def merge_tracks(
     poses_by_track: Mapping[str, MarkerPose],
     weights: WeightsConfig,
 ) -> MergedTarget | None:
-    """Return the target as the mean of the markers' tracks, weighted by W
-    (`make_marker_weight_matrix`; equations 5, 8, 12 of the paper). The mean is over the tracks that
-    this frame's poses update or, if there are none, over the tracks that were measured last.
-    Returns None if there are no tracks."""
+    """Return the target merged from its `tracks`, by name: ``joint``, or ``large`` and ``small``.
+    Only the tracks that this frame's poses (`poses_by_track`, with the same names) update are used
+    or, if there are none, the tracks that were measured last. A single track is used as it is. Two
+    are averaged, with `weights` for the large marker (`make_marker_weight_matrix`; equation 8 of
+    the paper). Returns None if there are no tracks."""
     if not tracks:
         return None
     least = min(track.unseen_frames for track in tracks.values())

@@ -170,8 +170,9 @@ def deinterlace(
     state: PipelineState, frame: Frame, pipeline: Pipeline
 ) -> tuple[PipelineState, tuple[Frame, ...]]:
     """Return the new state, and the frames to pass to `step` one by one: the frame itself, or its
-    two fields in time order if the frame is interlaced and the order of its fields is known. Raises
-    InvalidValue for the same reasons as `step`."""
+    two fields in time order if the frame is interlaced and the order of its fields is known. All
+    are grey. Raises InvalidValue if the image is invalid or does not have the size given in the
+    calibration."""
     with one_thread():
         frame = _convert_to_grey(frame, pipeline.camera)
         fields, found = deinterlace_frame(state.interlacing_state, frame)

@@ -443,7 +443,8 @@ def angle_to_expected_normal_rad(rvec: Array, expected_normal_cam: Array) -> flo
 
 
 def _solve_closed_form(points: WeightedCorners) -> list[PoseCandidate]:
-    """Return the pose candidates from OpenCV's SQPNP solver; empty for collinear corners."""
+    """Return the poses from OpenCV's SQPNP solver that are finite and in front of the camera. The
+    list is empty if there are none or if the solver fails, for example for collinear corners."""
     try:
         _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
             points.object_points_m, points.image_points_px, points.K, None, flags=cv2.SOLVEPNP_SQPNP
@@ -533,9 +534,10 @@ def corner_lift_by_sheet_curl(object_points_m: Array, sheet_curl_sigma_per_m: fl
 
 
 def sheet_curl_weight_matrix(whitened_shift_per_sheet_curl_sigma: Array) -> Array:
-    """Return the weights ``(I + C C^T)^-1`` (2n, 2n) of whitened errors, where C is
-    `whitened_shift_per_sheet_curl_sigma` (2n, k), one column per mode. The weights are the inverse
-    of the errors' covariance: unit noise plus the shifts due to curl."""
+    """Return the weight matrix ``(I + C C^T)^-1`` (2n, 2n) of the whitened reprojection errors of n
+    corners on a curled sheet. C is `whitened_shift_per_sheet_curl_sigma` (2n, k): each column is
+    the shift of these errors for one standard deviation of one mode of curl. The matrix is the
+    inverse of the errors' covariance: unit noise plus the shifts due to curl."""
     inner = np.linalg.inv(
         np.eye(whitened_shift_per_sheet_curl_sigma.shape[1])
         + whitened_shift_per_sheet_curl_sigma.T @ whitened_shift_per_sheet_curl_sigma
@@ -592,9 +594,10 @@ class WeightedCorners:
             errors with unit variance.
         whitened_corner_shift_per_common_error_sigma: whitened shift of the corners for one standard
             deviation of each error that is common to several corners, one column per error (2n, k).
-            These errors are the growth of white over black at all edges, the error of the
-            rolling-shutter readout time (`corner_shift_per_readout_sigma_px` of the detections),
-            and the row jitter in each detection.
+            These errors are the remaining shift of all black-white edges (blooming, gamma), the
+            error of the rolling-shutter readout time (`corner_shift_per_readout_sigma_px` of the
+            detections), and the horizontal jitter of image rows in each detection, which has two
+            columns.
         corner_lift_per_sheet_curl_sigma_m: result (2n, 2) of `corner_lift_by_sheet_curl`.
         allows_for_sheet_curl: True if the sheet may be curled, which reduces the weight of corners
             that curl would move; False if the sheet is assumed to be flat.

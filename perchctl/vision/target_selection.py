@@ -59,10 +59,13 @@ def marker_to_own_target_distance_m(
 ) -> float:
     """Return the horizontal distance, m, of a marker with corners (4, 2) px in the distorted image
     from the position of the vehicle's own target, or from the gear if this position or the attitude
-    is unknown. `t_s` and `attitude` are those of the frame. The marker's position follows from a
-    pose estimated from its corners; if they yield no pose, the distance is assumed to be
-    `_ASSUMED_DISTANCE_WITHOUT_POSE_M`. If `attitude` is known, distances above
-    `own_target.max_distance_m`, including the assumed one, become infinite."""
+    is unknown. `t_s` and `attitude` are those of the frame.
+
+    The marker's position follows from a pose estimated from its corners. If they yield no pose, the
+    distance is assumed to be 1e9 m (`_ASSUMED_DISTANCE_WITHOUT_POSE_M`), so that a search chooses
+    this marker last. If `attitude` is known, distances above `own_target.max_distance_m`, including
+    the assumed one, become infinite, so that a search rejects the marker.
+    """
     seen = Detection(marker, corners_px, _RAW_CORNER_SIGMA_PX, are_corners_fitted=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
     distance_m = (
@@ -119,7 +122,8 @@ def target_level_to_world(
 ) -> tuple[Array, float]:
     """Convert a target's position (3,), m, relative to the gear, and its heading, rad, from the
     level frame to the world frame of the state estimate. `attitude` is the vehicle's attitude and
-    position in this frame. Returns the target's position, m, and heading, rad, in the world."""
+    position in the world frame. Returns the target's position, m, and heading, rad, in the
+    world."""
     body_to_target_m = gear_to_target_level_m + attitude.R_level_body.dot(setup.gear_body_m)
     position_m = np.asarray(attitude.position_m) + attitude.R_world_level.dot(body_to_target_m)
     return position_m, wrap_rad(target_yaw_level_rad + attitude.yaw_rad)
@@ -151,13 +155,15 @@ def make_track_measurement(
 ) -> TrackMeasurement:
     """Convert a pose to a filter measurement of (yaw, x, y, z), rad and m: in the world frame of
     the state estimate (if `is_in_world_frame`), or relative to the gear in the level frame.
-    `attitude` is the vehicle's state at the time of the pose; it is required for the world frame
-    and otherwise None if unknown.
+    `attitude` is the vehicle's state at the time of the pose. It may be None (unknown) for the
+    level frame, but not for the world frame.
 
     The measurement's covariance R does not include the errors that are the same in every frame: the
-    biases of the vehicle's roll and pitch and of the print. The shifts due to these biases are a
-    separate field. R is None, so that the R of the filter setup applies, if the pose has no finite
-    covariance or the filter uses fixed noise.
+    biases of the vehicle's roll and pitch, and the errors of the print's size and curl. Their
+    effects are in `yaw_xyz_shift_per_bias_sigma` instead. If the pose has no covariance or the
+    filter uses fixed noise (no `filter_setup.acceleration_process_noise`), R and these effects are
+    None. If the covariance is not finite, only R is None. Without R, the filter uses the fixed
+    `filter_setup.R`.
     """
     z, lever_m = np.empty(4), pose.e_m  # an error of the vehicle's tilt rotates this lever arm
     z[0], z[1:] = pose.e_yaw_rad, pose.e_m

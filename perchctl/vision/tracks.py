@@ -85,15 +85,17 @@ def update_tracks(
     is_in_world_frame: bool,
     setup: TrackSetup,
 ) -> TrackedFrame:
-    """Update the tracks with the poses of one frame, `marker_poses`. The gate decides from the most
-    certain of them whether the frame shows the tracked target (`judge_pose`): it accepts all poses
-    or none. Without accepted poses, the tracks are only predicted to `t_s`, the time of the frame.
-    `attitude` is the vehicle's state at this time; None if unknown.
+    """Update the tracks, which are the Kalman filters of the target, with the poses of one frame,
+    `marker_poses`. The gate (`judge_pose`) decides from the most certain pose whether the frame
+    shows the locked target, which is the one that perchctl follows (`state.lock`). It accepts
+    either all poses or none. Without accepted poses, the tracks are only predicted to `t_s`, the
+    time of the frame. `attitude` is the vehicle's state at this time; None if unknown.
 
-    If the gate restarts the tracks, or if they change between the world frame (`is_in_world_frame`)
-    and the level frame, they start over. If there is no lock, or if it changes to another position,
-    a pose is also rejected if it shows another vehicle's target. If the gate is disabled, there is
-    no lock and no rival.
+    The tracks start over if the gate restarts them, or if `is_in_world_frame`, which selects the
+    world or the level frame, has changed since the last frame. If no target is locked, or if the
+    lock would change to another position, a pose that shows another vehicle's target is also
+    rejected. If the gate is disabled, all other poses are accepted, and the result has no lock and
+    no rival.
     """
     filter_setup = setup.select_filter(is_in_world_frame)
     measurements = {
@@ -240,10 +242,11 @@ class FramePose:
 class GateVerdict:
     """The gate's decision on a pose: whether it is accepted as a pose of the target, and whether
     the tracks restart at this pose (`restarts_track`). At a restart, `keeps_lock_at_restart` is
-    True if the pose still belongs to the locked target, and False if the lock changes to the rival.
+    True if the pose still belongs to the target that was followed so far, and False if another
+    target-like pattern (the rival) replaces it.
 
-    `rival` is the rival track after this frame, None if there is none; `reason` explains a
-    rejection or a restart, and is otherwise empty.
+    `rival` is the track of a pattern whose position contradicts the target's, after this frame;
+    None if there is none. `reason` explains a rejection or a restart, and is otherwise empty.
     """
 
     is_accepted: bool
@@ -324,10 +327,14 @@ def judge_pose(
 def drop_expired_lock_and_rival(
     lock: TargetLock | None, rival: RivalTrack | None, t_s: float
 ) -> tuple[TargetLock | None, RivalTrack | None]:
-    """Return the lock and the rival, each replaced by None if it has expired at `t_s`. A rival, or
-    a lock in the level frame without a rival, expires if it was not seen for `MAX_TRACK_GAP_S` (1
-    s). Any other lock expires after `LOCK_TIMEOUT_S` (10 s). Without a lock, the rival is dropped
-    too, and both are dropped if the clock was set back by more than `MAX_TRACK_GAP_S`."""
+    """Return the lock (the target that is followed) and the rival (a similar pattern at a position
+    that contradicts the target's), each replaced by None if it has expired at `t_s`.
+
+    A rival expires if it was not seen for `MAX_TRACK_GAP_S` (1 s). A lock in the level frame
+    expires after the same time if there is no rival. Any other lock expires if its target was not
+    seen for `LOCK_TIMEOUT_S` (10 s). Without a lock, the rival is dropped too, and both are dropped
+    if `t_s` is more than `MAX_TRACK_GAP_S` before the lock's time because the clock was set back.
+    """
     if rival is not None and not 0.0 <= t_s - rival.track.t_s <= MAX_TRACK_GAP_S:
         rival = None
     if lock is None:
@@ -348,13 +355,14 @@ def predict_rival_state(
     t_s: float,
     filter_setup: FilterSetup,
 ) -> Array | None:
-    """Return the rival's state (8,), predicted to `t_s`, if the rival was seen more recently than
-    the locked target: yaw, yaw rate, then position and velocity of x, y, z, in SI units. Return
-    None otherwise, or if lock and rival are not both in the frame of the tracks: the world frame
-    (if `is_in_world_frame`) or the level frame.
+    """Return the state of the rival, a target-like pattern whose position contradicts the locked
+    target's, predicted to `t_s`: yaw, yaw rate, then position and velocity of x, y, z, (8,), in SI
+    units. The caller widens the target's covariance to cover this state, because the target may be
+    at either position.
 
-    Until one of the two is confirmed, the target may be at either position, so the estimate must
-    cover both.
+    Returns None if there is no lock or no rival, if the target was seen at least as recently as the
+    rival, or if lock and rival are not both in the frame of the tracks: the world frame (if
+    `is_in_world_frame`) or the level frame.
     """
     if (
         lock is None
@@ -370,12 +378,13 @@ def predict_rival_state(
 def update_lock(
     lock: TargetLock | None, track: MarkerTrack, frame_pose: FramePose, verdict: GateVerdict
 ) -> TargetLock:
-    """Return the updated lock after the gate has accepted `frame_pose`. `track` is the track that
-    this pose has updated.
+    """Return the updated lock, the record of the target that is followed, after the gate has
+    accepted `frame_pose`. `track` is the track that this pose has updated.
 
-    If `lock` is None, a new lock is created. The count of accepted frames and the previous track
-    are kept, unless the track has restarted at a rival or the frame (level or world) of the tracks
-    has changed; in that case the lock starts over.
+    The count of accepted frames goes on, and the lock remembers whether both markers were ever
+    seen, and its previous track. If there was no lock, if the track has restarted at another
+    pattern, or if the frame of the tracks (level or world) has changed, a new lock begins without
+    this history.
     """
     anew = verdict.restarts_track and not verdict.keeps_lock_at_restart
     before = (
@@ -411,8 +420,9 @@ class _Innovation:
 
     @property
     def log_likelihood_cost(self) -> float:
-        """The squared Mahalanobis distance plus a penalty for a larger covariance, which is twice
-        the negative log likelihood without its constant."""
+        """Twice the negative log likelihood of the innovation without its constant: the squared
+        Mahalanobis distance plus the logarithm of the determinant of `S`. Of two tracks, a pose
+        more likely belongs to the one with the smaller cost."""
         return self.squared_mahalanobis + float(np.linalg.slogdet(self.S)[1])
 
     @property
@@ -454,8 +464,9 @@ def _is_pose_clearly_consistent(
     track: MarkerTrack, frame_pose: FramePose, filter_setup: FilterSetup
 ) -> bool:
     """True if the difference between the pose and the track's prediction is so small that the
-    unmodelled errors of lens, print and latency alone explain it, as in most frames. This fast
-    check, without any covariance, then makes the full one unnecessary."""
+    unmodelled errors of lens, print and latency alone explain it, as in most frames. The pose then
+    fits the track, and no covariance has to be computed. If False, the pose may still fit, and the
+    full check with the covariance decides."""
     wanted = predict_track(track, frame_pose.t_s, filter_setup)
     residual = frame_pose.measurement.z - wanted.x[MEASURED_ELEMENTS]
     residual[0] = wrap_rad(float(residual[0]))
@@ -602,11 +613,15 @@ def _is_rival_accepted_as_target(
 
 
 def _is_rival_likely_target(lock: TargetLock, rival: RivalTrack, frame_pose: FramePose) -> bool:
-    """True if the rival is most likely the target itself, displaced from the track because the
-    camera moved during lost frames. That is so if the rival was first seen after the target was
-    last seen, at least `MIN_RIVAL_ALONE_IN_VIEW_DURATION_S` (0.3 s) ago and in at least
-    `MIN_ESTABLISHED_LOCK_FRAMES` (5) frames. If the target was ever seen with both markers, only
-    frames that show both markers of the rival count. Only valid for a camera without a vehicle."""
+    """True if the rival, a target-like pattern whose position contradicts the target's track, is
+    most likely the target itself, because the camera moved during lost frames. Only valid for a
+    camera without a vehicle.
+
+    The rival must have been seen first no earlier than the target was last seen, and at least
+    `MIN_RIVAL_ALONE_IN_VIEW_DURATION_S` (0.3 s) before this frame. It must have been seen in at
+    least `MIN_ESTABLISHED_LOCK_FRAMES` (5) frames. If the target was ever seen with both markers,
+    only frames that show both markers of the rival count, and this frame must show both.
+    """
     if (
         rival.first_seen_at_s < lock.track.t_s
         or frame_pose.t_s - rival.first_seen_at_s < MIN_RIVAL_ALONE_IN_VIEW_DURATION_S
@@ -633,15 +648,16 @@ _NEW_MOTION_ERROR_WEIGHT = 0.1
 def predict_corners(
     last_pose: LastPose | None, t_s: float, attitude: VehicleState | None, setup: PoseSetup
 ) -> tuple[dict[MarkerName, Array] | None, PoseCandidate | None]:
-    """Predict the corners of both markers, (4, 2) px in the distorted image, and the pose of the
-    target in the camera frame at `t_s` from the last pose and the vehicle's motion since then. The
-    motion is the mean of two estimates, from positions and from velocities, weighted by their
-    recent errors (`LastPose.motion_errors`).
+    """Predict the corners of both markers and the pose of the target at `t_s` from the last pose
+    and the vehicle's motion since then. Returns the corners by marker, each (4, 2) px in the
+    distorted image, and the pose in the camera frame. The motion is a weighted mean of two
+    estimates, from positions and from velocities; the one with the smaller recent error
+    (`LastPose.motion_errors`) has more weight.
 
-    Returns (None, last pose) if the vehicle's attitude at either time is unknown, (None, predicted
-    pose) if the corners have no finite projection, and (None, None) if the last pose is not before
-    `t_s` or more than `MAX_TRACK_GAP_S` (1 s) old, or if the target is predicted to be behind the
-    camera.
+    Returns (None, last pose) if the vehicle's attitude at either time is unknown, and (None,
+    predicted pose) if the corners have no finite projection. Returns (None, None) if there is no
+    last pose, if it is not before `t_s` or more than `MAX_TRACK_GAP_S` (1 s) old, or if the target
+    is predicted to be behind the camera.
     """
     if last_pose is None or not 0.0 < t_s - last_pose.pose.t_s <= MAX_TRACK_GAP_S:
         return None, None
@@ -669,11 +685,14 @@ def update_last_pose(
     previous: LastPose | None, pose: MarkerPose, attitude: VehicleState | None, setup: PoseSetup
 ) -> LastPose:
     """Return `pose` as the new last pose, with the vehicle's `attitude` at that time (None if
-    unknown) and the updated running errors of the vehicle's estimated motion.
+    unknown) and the updated running errors of the vehicle's estimated motion (`MotionErrors`).
 
-    These errors are the differences, across the line of sight, between the vehicle's estimated
-    motion since the `previous` pose and the motion of the target in the image. They stay unchanged
-    if an attitude is unknown or the previous pose is more than `MAX_TRACK_GAP_S` (1 s) older.
+    These are mean squared errors, rad^2, of the motion from positions and of the motion from
+    velocities. The new error of each is the difference, across the line of sight, between the
+    camera's estimated motion since the `previous` pose and its motion measured with the target,
+    divided by the distance to the target. The mean errors are 0 if `previous` is None. They stay
+    unchanged if an attitude is unknown, or if `previous` is not older than `pose` or more than
+    `MAX_TRACK_GAP_S` (1 s) older.
     """
     if previous is None:
         return LastPose(pose, attitude)

@@ -72,9 +72,9 @@ mm at 1 m. Larger: an error that no other check detects is accepted."""
 
 
 def check_camera_matrix(K: Array) -> None:
-    """Raise InvalidValue if the camera matrix does not have the shape (3, 3) and the form (fx, s,
-    cx), (0, fy, cy), (0, 0, 1) with a skew s of at most `MAX_CAMERA_MATRIX_SKEW_PX` (0.3 px), for
-    example because it is transposed."""
+    """Raise InvalidValue if the camera matrix is not of the shape (3, 3) and the form (fx, s, cx),
+    (0, fy, cy), (0, 0, 1), for example because it is transposed, or if its skew s is larger than
+    `MAX_CAMERA_MATRIX_SKEW_PX` (0.3 px)."""
     if K.shape != (3, 3):
         raise InvalidValue(f"the camera matrix must have the shape (3, 3), found {K.shape}")
     if (K[1:, 0] == 0.0).all() and K[2, 1] == 0.0 and K[2, 2] == 1.0:
@@ -152,19 +152,21 @@ class Detection:
     Attributes:
         sigma_px: standard deviation of the corners, from the residuals of the line fit, or a
             default value if no lines were fitted.
-        are_corners_fitted: True if the corners come from a line fit or a photometric fit, False if
-            they come from OpenCV or from the other marker.
-        remaining_edge_shift_sigma_px: standard deviation of the common outward shift of all edges
-            that remains after the correction of this shift.
-        corner_shift_per_readout_sigma_px: change (4, 2) of the corners for one standard deviation
-            of the readout-time error, which is common to both markers; None if there is no such
-            error.
+        are_corners_fitted: True if the corners come from a line fit or a photometric fit; False if
+            they come from OpenCV or were inferred from the other marker, which is less accurate.
+        remaining_edge_shift_sigma_px: standard deviation of the distance by which all edges of the
+            marker may still be shifted outwards or inwards (blooming, gamma), after a correction
+            or without one.
+        corner_shift_per_readout_sigma_px: change (4, 2) of the corners, px, for one standard
+            deviation of the error of the rolling-shutter readout time, which is common to both
+            markers; None if this error is not considered.
         cov_px2: covariance (8, 8) of corners that were inferred from a visible part of the marker
             and may be outside the image. It is in pixels of a pinhole camera, in the order x0, y0,
-            x1, y1, ...
-        row_jitter_sigma_px: standard deviation of the corners due to row jitter in analogue video.
-        horizontal_side_extra_sigma_px: additional standard deviation of the sides along the image
-            rows if every second row is interpolated.
+            x1, y1, ...; None for corners from other methods.
+        row_jitter_sigma_px: standard deviation of the corners along x, because analogue video
+            shifts each image row horizontally by a random distance (row jitter).
+        horizontal_side_extra_sigma_px: additional standard deviation of the position of horizontal
+            sides, perpendicular to the side, if every second row of the image is interpolated.
     """
 
     marker: MarkerName
@@ -267,18 +269,20 @@ class MarkerPose:
 
     Attributes:
         rvec_rad, tvec_m: pose in the OpenCV camera frame, with cv2.aruco's marker axes, (3,).
-        e_m: position of the target relative to the gear in the level frame, (3,).
+        e_m: position of the target relative to the gear in the level frame, (3,): x forward, y
+            left and z up, with the heading of the vehicle but without its roll and pitch.
         e_yaw_rad: heading of the target's x axis in the level frame, positive counter-clockwise
             seen from above.
         sigma_m, sigma_yaw_rad: standard deviations of `e_m`, (3,), and of `e_yaw_rad`.
         rms_reprojection_px: RMS distance between the projected and the measured corners.
         chi2_per_dof: sum of the squared errors of the corners divided by their variances, per
             degree of freedom.
-        xyz_yaw_cov: covariance (4, 4) of (e_x, e_y, e_z, e_yaw), SI.
-        shift_per_print_error_sigma_m: shift of `e_m` for one standard deviation of the print's size
-            error and of the sheet's curl, (3, 2). These errors are included in `sigma_m` and
-            `xyz_yaw_cov`, but are the same in every frame.
-        rvec_tvec_cov: covariance (6, 6) of (rvec_rad, tvec_m), without print errors.
+        xyz_yaw_cov: covariance (4, 4) of (e_x, e_y, e_z, e_yaw), m and rad; None if unknown.
+        shift_per_print_error_sigma_m: shift (3, 2) of `e_m` for one standard deviation of the
+            print's size error (column 0) and of the sheet's curl (column 1). These errors are
+            included in `sigma_m` and `xyz_yaw_cov`, but are the same in every frame.
+        rvec_tvec_cov: covariance (6, 6) of (rvec_rad, tvec_m), without these print errors; None if
+            unknown.
     """
 
     source: Literal["large", "small", "joint"]
@@ -457,8 +461,9 @@ class MarkerPoses:
 
     @property
     def most_certain_pose(self) -> MarkerPose | None:
-        """The pose with the smallest standard deviation, from `poses_by_track` if it is not empty,
-        otherwise from `poses_by_source`; None if there are no poses."""
+        """The pose whose position has the smallest standard deviation (norm of `sigma_m`), from
+        `poses_by_track` if it is not empty, otherwise from `poses_by_source`; None if there are no
+        poses."""
         poses = self.poses_by_track or self.poses_by_source
         return min(poses.values(), key=lambda p: float(p.sigma_m @ p.sigma_m), default=None)
 
@@ -468,15 +473,16 @@ class InterlacingState:
     """What is known about the interlacing of an image stream.
 
     Attributes:
-        picture_kind: kind of the last frame that was checked for combing; ``woven`` from the first
-            interlaced frame on.
+        picture_kind: kind of the last frame that was checked for interlacing artefacts (combing),
+            None before the first one. Once a frame was interlaced, it stays ``woven``.
         frames_since_combing_check: number of frames since that check.
         top_field_first_vote_sum: sum of the votes on the order of the fields: positive if the top
             field seems to be first, negative if the bottom field does.
         is_top_field_first: order of the fields; None until the votes decide.
         frame_periods_s: the most recent times between successive frames.
         last_frame_t_s: time of the last frame.
-        previous_image: the previous image; None if it was not interlaced.
+        previous_image: the previous image, to which the next one is compared to find the order of
+            the fields; None if it was not interlaced.
     """
 
     picture_kind: PictureKind | None = None
