@@ -164,9 +164,9 @@ def step_landing(
 
 
 def record_command(state: PlannerState, command: Command) -> tuple[PlannerState, Command]:
-    """Return the result of a tick: the state, in which the time of the tick and the commanded raw
-    thrust (None for any command other than raw thrust or `Idle`) are stored for later ticks, and
-    `command` itself."""
+    """Return the result of a tick: the state, with the time of the tick and the commanded raw
+    thrust stored for later ticks, and `command` itself. `Idle` leaves the stored raw thrust
+    unchanged; any other command that is not a raw thrust sets it to None."""
     order = state.commanded_raw_thrust
     if not isinstance(command, Idle):
         order = command.thrust if isinstance(command, RawThrust) else None
@@ -175,8 +175,11 @@ def record_command(state: PlannerState, command: Command) -> tuple[PlannerState,
 
 
 def begin_landing(state: PlannerState) -> PlannerState:
-    """Return the state at the start of the phase LANDING; unchanged if the landing has begun
-    already."""
+    """Return the state at the start of the phase LANDING, with the present time, position and
+    heading as those of the phase's start, and a severity of at least `LAND`. The start times of
+    conditions are forgotten, except for conditions that persist across phases, and the descent is
+    prepared (`enter_descent`). If the landing has begun already, the state is returned
+    unchanged."""
     if state.phase is Phase.LANDING:
         return state
     b, tel = state.belief, state.belief.telemetry
@@ -364,10 +367,12 @@ def _has_fallen_off_magnet(c: Context) -> bool:
 
 
 def _is_standing_on_floor(c: Context) -> bool:
-    """True if the vehicle is proven to be on the floor: `ON_FLOOR` has been true for
-    `ON_FLOOR_DWELL_S`; or, in a descent by raw thrust with valid positions from the target, the
-    vehicle is lower than `MAX_HEIGHT_TO_COUNT_AS_LANDED_M`, slower than
-    `MAX_VERTICAL_SPEED_OF_MOTIONLESS_VEHICLE_MPS`, and cannot be on the magnet."""
+    """True if the vehicle is proven to be on the floor, in one of two ways. The condition
+    `ON_FLOOR` (motionless, with too little thrust to fly, and low or further down than at the
+    start) has been true for `ON_FLOOR_DWELL_S`, and the telemetry is fresh. Or, in a descent by raw
+    thrust with valid positions from the target, the vehicle is lower than
+    `MAX_HEIGHT_TO_COUNT_AS_LANDED_M`, its vertical speed is below
+    `MAX_VERTICAL_SPEED_OF_MOTIONLESS_VEHICLE_MPS`, and it cannot be on the magnet."""
     b = c.belief
     if b.is_telemetry_fresh and c.true_for_s(ON_FLOOR) >= ON_FLOOR_DWELL_S:
         return True
@@ -384,8 +389,10 @@ def _is_standing_on_floor(c: Context) -> bool:
 
 
 def _restart_landing_by_catching_fall(c: Context) -> Action:
-    """Restart the landing at the present height, beginning with a setpoint above the vehicle that
-    stops the fall (a catch)."""
+    """Return the new state and command of a landing that restarts at the vehicle's present
+    position, after a fall off the magnet. The recorded contact, weight transfer and motor stop are
+    forgotten. The command is a setpoint above the vehicle that stops the fall (a catch) or, if no
+    catch is possible, the first command of the descent."""
     tel, b = c.telemetry, c.belief
     belief = replace(
         b,
@@ -413,8 +420,9 @@ def _restart_landing_by_catching_fall(c: Context) -> Action:
 
 
 def _catch_fall(c: Context) -> Action | None:
-    """Catch the fall under position control (`catch_falling_vehicle`); None without a heading, with
-    diverged positions, or if there is no fall to catch."""
+    """Return the new state and the setpoint above the vehicle that stops its fall
+    (`catch_falling_vehicle`); None without a heading, with diverged positions, with old telemetry,
+    or if no fall has to be caught any more."""
     return (
         None
         if c.belief.is_heading_lost or c.belief.is_position_diverged
@@ -426,9 +434,11 @@ def _catch_fall(c: Context) -> Action | None:
 
 
 def _descend_by_setpoints(c: Context) -> Action:
-    """Lower the position setpoint at `landing.speed_mps` towards the ground, vertically below the
-    position at which the landing began. With recent telemetry, the setpoint stays within
-    `MAX_SETPOINT_DISTANCE_BELOW_VEHICLE_M` below the vehicle."""
+    """Return the new state and the position setpoint of a descent by setpoints. In each tick, the
+    setpoint sinks at `landing.speed_mps` towards the ground, vertically below the position at which
+    the landing began. With recent telemetry, it stays within
+    `MAX_SETPOINT_DISTANCE_BELOW_VEHICLE_M` below the vehicle. The setpoint that is sent also
+    contains the lateral integral and is limited to the fence and the height range."""
     landing, state, b = c.planner.landing, c.state, c.belief
     here = make_setpoint_at_vehicle(c)
     start = here
@@ -452,8 +462,9 @@ def _descend_by_setpoints(c: Context) -> Action:
 
 
 def _descend_by_raw_thrust(c: Context) -> Action:
-    """Descend level by raw thrust. With old telemetry and a hover thrust that is not known well
-    enough, descend by setpoints at first (`should_begin_descent_with_setpoints`).
+    """Return the new state and command of a level descent by raw thrust. With old telemetry and a
+    hover thrust that is not known well enough, the descent begins by setpoints
+    (`should_begin_descent_with_setpoints`).
 
     In a tick in which the estimated heading jumps, one setpoint with the new heading is sent
     instead. Under raw thrust, the firmware keeps the heading setpoint that it received last, so it
@@ -505,10 +516,11 @@ def make_onboard_landing_command(
 
 
 def _command_onboard_landing(c: Context) -> Action:
-    """Send the command for the firmware's own landing, and repeat it every
-    `LANDING_COMMAND_PERIOD_S`, at most `MAX_LANDING_COMMAND_COUNT` times in all, until the
-    telemetry shows that the firmware is executing it. Send `Idle` in all other ticks. A press that
-    has not ended may have to end before.
+    """Return the new state and command of the firmware's own landing. The landing command is
+    repeated every `LANDING_COMMAND_PERIOD_S`, at most `MAX_LANDING_COMMAND_COUNT` times in all,
+    until the telemetry shows that the firmware is executing it. The command is `Idle` in all other
+    ticks. With reliable flight data, a press that has not ended is ended by setpoints before the
+    first landing command.
 
     The firmware stops the motors at the end of its trajectory. If that would happen in the air, one
     setpoint ends the trajectory, and a new landing is commanded. There are two such cases. A
@@ -592,16 +604,17 @@ def _command_onboard_landing(c: Context) -> Action:
 
 
 def _transfer_weight_to_magnet(c: Context) -> Action:
-    """Reduce raw thrust until the magnet carries the vehicle. Telemetry with an age up to
+    """Return the new state and command of a weight transfer to the magnet: raw thrust that falls
+    until the magnet carries the vehicle, and then the motor stop. Telemetry with an age up to
     `safety.telemetry_hold_s` is accepted; during a perch, only fresh telemetry is."""
     return transfer_weight_by_raw_thrust(c, max_stale_telemetry_age_s=c.safety.telemetry_hold_s)
 
 
 def _complete_weight_transfer_to_magnet(c: Context) -> Action:
-    """Continue a weight transfer that has begun. If the attitude in the telemetry is older than
-    `safety.telemetry_hold_s`, a fall could not be detected, so the transfer starts over, with
-    a thrust of at most `MIN_COMMANDED_TO_HOVER_THRUST_RATIO` of the hover thrust: a hanging vehicle
-    stays in place, and a fallen one does not climb."""
+    """Return the new state and command of a weight transfer that has begun. If the attitude in the
+    telemetry is older than `safety.telemetry_hold_s`, a fall could not be detected, so the transfer
+    starts over, with a thrust of at most `MIN_COMMANDED_TO_HOVER_THRUST_RATIO` of the hover thrust:
+    a hanging vehicle stays in place, and a fallen one does not climb."""
     if c.belief.attitude_age_s <= c.safety.telemetry_hold_s:
         return _transfer_weight_to_magnet(c)
     part = MIN_COMMANDED_TO_HOVER_THRUST_RATIO * c.belief.hover_thrust

@@ -281,9 +281,11 @@ class Tick:
 
     @property
     def target_to_show(self) -> TargetEstimate | None:
-        """The target estimate, for displays; None if it may no longer be true: the estimate of a
-        target that the camera cannot see drifts, so a display shows it only until the contact is
-        proven or the flight is over."""
+        """The target estimate, for displays; None before the first sighting. In COMPLETE and the
+        final phases, it is None while the target is not tracked, because the estimate of a target
+        that the camera cannot see drifts; in all other phases, it is shown even while the target is
+        not tracked. It is also None once `gear_to_target_at_contact` is recorded, which displays
+        show instead."""
         target, phase = self.target, self.state.phase
         is_shown_unseen = phase.is_before_contact or phase is Phase.LANDING
         is_shown = target is not None and (target.tracked or is_shown_unseen)

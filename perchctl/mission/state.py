@@ -17,9 +17,10 @@ from perchctl.vehicle import EmergencyStop, PositionSetpoint, StopMotors
 
 @dataclass(frozen=True)
 class BatteryOutlook:
-    """How long the battery lasts: predicted hover time, s, until row `battery-low` would land the
-    vehicle; number of attempts that the battery allows, with a landing after the last one; charge
-    consumed so far, mAh; and resting voltage (without load), V. None means unknown."""
+    """How long the battery lasts: predicted hover time, s, until row `battery-low` of the
+    transition table would land the vehicle; number of attempts that the battery allows, with a
+    landing after the last one; charge consumed so far, mAh; and resting voltage (without load), V.
+    None means unknown."""
 
     hover_time_left_s: float | None = None  # hover time until `battery-low` would land the vehicle
     # attempts that the battery allows, with the landing after the last one; None before the first

@@ -240,14 +240,17 @@ class Belief:
 
     @cached_property
     def is_position_stale(self) -> bool:
-        """True if the position is older than `positioning.hold_s`, too old for position control."""
+        """True if `position_correction_age_s`, the age of the newest external position or, with
+        decks, of the newest correction, exceeds `positioning.hold_s`: the estimated position is
+        then too old for position control."""
         return self.position_correction_age_s > self.profile.positioning.hold_s
 
     @cached_property
     def is_position_trusted(self) -> bool:
-        """True if the estimated position and velocity can be trusted: positions have arrived for
+        """True if the estimated position and velocity can be trusted: external positions (or, with
+        decks, corrections) have arrived without a gap for longer than
         `ESTIMATE_SETTLING_TIME_AFTER_POSITIONS_RETURN_S`, have not led the vehicle away from its
-        setpoint (diverged) and, if they come from pictures, agree with the accelerometer."""
+        setpoint and, if they come from pictures, agree with the accelerometer."""
         doubted = self.is_position_diverged or (
             self.is_target_position_source and self.obs.camera_imu_mismatch is not None
         )
@@ -327,10 +330,13 @@ class Belief:
 
     @cached_property
     def has_only_imu_for_descent(self) -> bool:
-        """True if only accelerometer and attitude remain for a descent: with the target as the
-        position source, once `can_descend_with_target_as_position_source` is false; with a deck or
-        motion capture, while positions are missing or too new to be trusted, but not once they have
-        diverged."""
+        """True if a descent can use only accelerometer and attitude.
+
+        With the target as the position source, this is the case once
+        `can_descend_with_target_as_position_source` is false. With a deck or motion capture, it is
+        the case while positions are missing or have returned too recently to be trusted, but not
+        once they have diverged.
+        """
         if self.is_target_position_source:
             return not self.can_descend_with_target_as_position_source
         return not (self.is_position_trusted or self.is_position_diverged)
@@ -478,8 +484,8 @@ class Belief:
 
     @cached_property
     def camera_imu_mismatch(self) -> CameraImuMismatch:
-        """Error of the camera's latency or mounting that would explain why the target appears to
-        move; zero if there is none."""
+        """Error of the camera's latency, s, or of its yaw in the mounting, rad, that explains why
+        pictures and accelerometer disagree; both values are 0 while they do not disagree."""
         return self.obs.camera_imu_mismatch or CameraImuMismatch()
 
     @cached_property

@@ -182,7 +182,8 @@ class LateralOffsetFilter:
         )
 
     def _propagate_through_samples(self, t_s: float) -> LateralOffsetFilter:
-        """Return the filter propagated to the later time `t_s` with all samples up to it. Between
+        """Return the filter at the later time `t_s`: propagated with the acceleration from the
+        samples' tilt, and corrected with the estimated velocity of each sample up to `t_s`. Between
         two samples, the acceleration is their mean; after the last sample, it stays constant."""
         predicted, before = self, self.samples[0] if self.samples else None
         for sample in self.samples:

@@ -31,9 +31,9 @@ class Maneuver:
         climbs_to_target: the vehicle climbs to the target. Close to the target, hover thrust is not
             learned because the ground effect of the ceiling supports part of the weight.
         presses_against_target: the vehicle is meant to touch the target. With the target as the
-            only position source, the position of the last sighting may prove a contact. Such a
-            maneuver is neither in free air nor guided by the camera, so no hold applies: a hold
-            would leave the vehicle pressed.
+            only position source, a contact may be proven without a valid position, by dead
+            reckoning since the last sighting. Such a maneuver is neither in free air nor guided by
+            the camera, so no hold applies: a hold would leave the vehicle pressed.
         retreats_after_attempt: the vehicle leaves the position where an attempt ended. If something
             is still holding the vehicle there, its offset from the target is the offset of the last
             touch.

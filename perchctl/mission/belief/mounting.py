@@ -114,8 +114,9 @@ class CameraMountingMonitor:
         is_target_stationary: the present sightings show a stationary target.
         contradicting_sighting_count: number of successive sightings, up to the newest one, that
             contradict the mounting.
-        camera_yaw_error_rad: rotation of the mounting about the vehicle's upward axis with which
-            the target would be stationary, rad; 0 until a sighting contradicts the mounting.
+        camera_yaw_error_rad: rotation of the camera, relative to its mounting in the profile, with
+            which the target would be stationary, about the vehicle's upward axis, positive
+            counter-clockwise from above; 0 until a sighting contradicts the mounting.
     """
 
     sightings: tuple[CameraMountingSample, ...] = ()
@@ -135,8 +136,9 @@ class CameraMountingMonitor:
 
     @property
     def is_target_motion_undetermined(self) -> bool:
-        """True until the vehicle has moved far enough to show whether the target is stationary in
-        the world, as it is if the mounting is right."""
+        """True until the sightings have shown that the target is stationary in the world, as it is
+        if the mounting is right. Before that, the vehicle may have moved too little, or the
+        mounting may be wrong (`is_camera_mounting_wrong`)."""
         return not (self.is_camera_mounting_confirmed or self.is_target_stationary)
 
 
@@ -201,9 +203,15 @@ def _has_target_or_estimate_jumped(
 def _judge_camera_mounting(
     monitor: CameraMountingMonitor, previous_contradicting_sighting_count: int
 ) -> CameraMountingMonitor:
-    """Return the monitor with the verdict of its sightings: the target is stationary, or the newest
-    sighting contradicts the mounting and is added to `previous_contradicting_sighting_count`;
-    unchanged if the motion is too small or the fit is ambiguous."""
+    """Return the monitor after a complex least-squares fit to its sightings: how the target seems
+    to move if the vehicle's upward axis moves (`update_camera_mounting_monitor`).
+
+    If the target hardly moves, the monitor says that it is stationary and, after enough motion of
+    the vehicle, that the mounting is confirmed. If it moves as with a camera rotated far from the
+    profile, the number of contradicting sightings becomes `previous_contradicting_sighting_count` +
+    1, and the rotation is stored. The monitor is unchanged if the vehicle has moved too little or
+    the fit is ambiguous.
+    """
     aims, targets = (
         [s.up_axis_at_target_height_world_xy_m for s in monitor.sightings],
         [s.target_world_xy_m for s in monitor.sightings],

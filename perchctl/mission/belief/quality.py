@@ -115,10 +115,11 @@ def hold_reason(b: Belief, maneuver: Maneuver) -> str:
 
 
 def position_loss_text(b: Belief) -> str:
-    """Return a message such as "no position for 1.2 s: ...": for how long no external position has
-    been sent or, with decks, no measurement has corrected the estimate, and the reason if it is
-    known. After a sideways push that no position has corrected yet, the message says this
-    instead."""
+    """Return a message for a lost position, such as "no position for 1.2 s: ...": how long ago the
+    newest external position was sent or, with decks, the newest measurement corrected the estimate,
+    and the reason if it is known. The message is "no position has arrived" if there has been none.
+    After a sideways push that no position has corrected yet, the message says this instead. The
+    function does not check whether the position is lost."""
     if b.is_estimate_missing_gust:
         return "pushed sideways while the target was out of view"
     age_s, why = b.position_correction_age_s, b.obs.external_position_problem
@@ -134,9 +135,13 @@ def position_loss_text(b: Belief) -> str:
 
 
 def excessive_variance_text(b: Belief) -> str:
-    """Return a message that names the variance that is too large, and its limit: the variance of
-    the estimated velocity or, if that is small enough, of the estimated position (with decks, of
-    the height). If this variance is unknown, the message says so."""
+    """Return a message that names the variance that is too large, and its limit. Call it only while
+    `is_estimate_variance_too_large` is true.
+
+    The message names the variance of the estimated velocity if it is too large, otherwise that of
+    the estimated position (with decks, of the height). If this variance is unknown, the message
+    says so.
+    """
     safety = b.profile.safety
     what, variance, unit = "velocity", b.max_axis_velocity_variance_m2ps2, "(m/s)^2"
     most = safety.flight_velocity_variance_m2ps2
@@ -149,6 +154,7 @@ def excessive_variance_text(b: Belief) -> str:
 
 
 def no_picture_reason(b: Belief) -> str:
-    """Return the camera's problem or, if none is known, a message that says for how long no good
-    picture has arrived."""
+    """Return why no good picture has arrived lately: the camera's problem or, if none is known, a
+    message such as "no picture for 1.2 s". The caller has found that the newest picture is too old;
+    this function does not check it."""
     return b.obs.camera_problem or f"no picture for {b.obs.last_good_frame_age_s:.1f} s"

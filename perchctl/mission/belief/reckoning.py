@@ -180,11 +180,13 @@ def advance_dead_reckoning(
 ) -> DeadReckoning:
     """Return the dead reckoning one tick later, advanced by the velocity that `imu` has gained
     since `old`. `sample` is the newest sample of `imu`. At the first sample, after a gap in the
-    telemetry, or while the attitude is frozen, the dead reckoning restarts instead.
+    telemetry, or while the attitude is frozen, the dead reckoning restarts instead: the velocity
+    comes from the state estimate, and the offset from the target becomes unknown.
 
     - `is_estimate_trusted`: pull the reckoned velocity towards the sample's estimated velocity, or
       adopt it at a restart, and learn from it the bias of the acceleration, which is due to
-      accelerometer and attitude.
+      accelerometer and attitude. If False, a restart adds only the change of the estimated velocity
+      since `old`.
     - `is_estimated_velocity_being_corrected`: external positions still correct the estimated
       velocity, so gradually forget the lateral velocity that only the accelerometer has measured.
     - `ignores_lateral_estimate`: use only the vertical part of the estimated velocity, because the
@@ -515,8 +517,10 @@ def learn_acceleration_bias_at_rest(
 
 
 def restart_velocity_bias_filters(old: DeadReckoning) -> DeadReckoning:
-    """Return the dead reckoning after an interruption of the velocity-bias learning: the bias is
-    kept, and the low-pass filters restart."""
+    """Return the dead reckoning with the low-pass filters of estimated velocity and position reset,
+    from which `learn_estimated_velocity_bias` learns the bias; they restart at the next sample. The
+    bias learned so far is kept. Called while the bias cannot be learned, for example after a gap in
+    the telemetry or a jump of the state estimate."""
     return (
         old
         if old.mean_estimated_position_world_xy_m is None
@@ -525,10 +529,15 @@ def restart_velocity_bias_filters(old: DeadReckoning) -> DeadReckoning:
 
 
 def correct_acceleration_bias_for_wrong_positions(old: DeadReckoning) -> DeadReckoning:
-    """Return the dead reckoning with its lateral acceleration bias corrected after positions in the
-    wrong axes. Such positions have given the state estimate a velocity that the accelerometer has
-    not measured and, in proportion to it, a wrong tilt, which was learned as a bias. The correction
-    is this velocity times `ACCELERATION_BIAS_PER_ESTIMATE_MINUS_IMU_VELOCITY_PER_S`."""
+    """Return the dead reckoning with its lateral acceleration bias (world x and y) corrected, once
+    external positions are known to be wrong, for example because the axes of the motion capture are
+    rotated.
+
+    Wrong positions give the state estimate a velocity that the accelerometer does not measure and,
+    in proportion to it, a wrong tilt, which was learned as part of the bias. The correction added
+    to the bias is this velocity, gained recently, times
+    `ACCELERATION_BIAS_PER_ESTIMATE_MINUS_IMU_VELOCITY_PER_S`.
+    """
     (bx, by, bz), (x_mps, y_mps) = (
         old.acceleration_bias_world_mps2,
         old.recent_estimate_minus_imu_velocity_world_xy_mps,

@@ -108,8 +108,8 @@ class VisualMotion:
 
     The vehicle moves by -de/dt, where e is the target's position relative to the gear in the level
     frame; a first-order low-pass filter smooths it. Only roll and pitch, which are used to level e,
-    come from the telemetry. If roll and pitch are old, they add e_z dphi/dt to the lateral velocity
-    while the vehicle tilts, and little to the vertical velocity. The velocity is wrong if the
+    come from the telemetry. If they are old while the true tilt phi changes, the lateral velocity
+    is wrong by e_z dphi/dt, and the vertical velocity by little. The velocity is wrong if the
     target moves; its lateral part is wrong if the camera's mounting differs from the profile.
 
     Attributes:

@@ -153,9 +153,9 @@ def reset_phase_dependent_conditions(b: Belief) -> Belief:
 
 
 def update_thrust_check_after_command(b: Belief, command: Command) -> Belief:
-    """Return the belief after `command` was sent. The check that the reported thrust follows the
-    commanded raw thrust continues after a raw thrust or an `Idle`, and ends after any other
-    command."""
+    """Return the belief after `command` was sent. The belief keeps the time since which the
+    reported thrust has differed from the commanded raw thrust if `command` is a raw thrust or
+    `Idle`, and forgets it after any other command."""
     if isinstance(command, (RawThrust, Idle)):
         return b
     return replace(b, thrust_began_to_differ_from_command_at_s=None)
@@ -298,8 +298,9 @@ def _compare_thrust_with_command(b: Belief) -> Belief:
 
 
 def _update_dead_reckoning(b: Belief) -> Belief:
-    """Return the belief with the dead reckoning one tick later, the time within the magnet's reach,
-    and the height of a vehicle without a position."""
+    """Return the belief with three fields advanced by one tick: `dead_reckoning`;
+    `magnet_reach_entered_at_s`, the time at which the gear came within the magnet's reach; and
+    `dead_reckoned_height_m`, which changes only once dead reckoning has replaced the position."""
     new = _integrate_dead_reckoning(b)
     new = _zero_reckoned_velocity_at_contact(b, new)
     new = _adopt_visual_inertial_velocity(b, new)
@@ -357,15 +358,18 @@ def _integrate_dead_reckoning(b: Belief) -> DeadReckoning:
 
 
 def _zero_reckoned_velocity_at_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
-    """Return the dead reckoning `new` with zero velocity if the vehicle is at rest at the target:
-    the gear is within the magnet's reach, the climb rate has been steady for
+    """Return the dead reckoning `new`, without vertical speed if the vehicle is at rest at the
+    target: the gear is within the magnet's reach, the climb rate has been steady for
     `STILL_AT_CONTACT_DWELL_S` without a recent fall, and either a contact is recorded or the thrust
-    is too small to fly. The lateral velocity becomes zero, and the acceleration bias is learned,
-    only if the lateral velocity is steady as well. With the motors off, the offset from the target
-    is kept.
+    is too small to fly. Otherwise, `new` is returned unchanged.
+
+    For a vehicle at rest, the lateral velocity becomes zero too, and the acceleration bias is
+    learned, if the lateral velocity has also been steady for that time. With the motors off, the
+    offset from the target stays that of the previous tick.
 
     Without this, the accelerometer's bias would move the reckoned position of a hanging vehicle out
-    of the magnet's reach within ten seconds."""
+    of the magnet's reach within ten seconds.
+    """
     obs = b.obs
     rests = (
         obs.t_s - obs.imu.climb_rate_became_steady_at_s >= STILL_AT_CONTACT_DWELL_S
