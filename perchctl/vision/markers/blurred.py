@@ -71,13 +71,16 @@ def find_expected_blurred_marker(
     expected_corners_px: Mapping[MarkerName, Array],
     blurred_fit_attempt_index: int | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
-    """Find blurred markers near their expected corners (4, 2) px in the image. Each marker is
-    shifted to where its drawing correlates best with the image, and then fitted (`align_marker`).
-    Return the first marker that the fit confirms, or an empty dict if there is none.
+    """Find a blurred marker near its expected corners (4, 2) px in the image. Every expected marker
+    that is completely in the image and not too small is tried, the large one first: its corners are
+    shifted to where its drawing correlates best with the image, and the drawing is then fitted
+    (`align_marker`). Return the corners of the first marker that the fit confirms, or an empty dict
+    if there is none.
 
-    `blurred_fit_attempt_index` is the number of earlier frames, since the markers were lost,
-    in which this function was tried. To save time, the fits start with a small blur if this number
-    is even and with a large blur if it is odd. If it is None, both are tried in this frame.
+    `blurred_fit_attempt_index` is the number of earlier frames, since the markers were lost, in
+    which this function was tried. To save time, the fits start with a blur of 1.5 px (standard
+    deviation) if this number is even and of 3 px if it is odd. If it is None, both are tried in
+    this frame.
     """
     image, patterns = detector_input.image, detector_input.setup.patterns
     blurs_px = (
@@ -239,14 +242,15 @@ def align_marker(
     must_exclude_other_codewords: bool = True,
 ) -> RefinedCorners | None:
     """Fit a marker's drawing to the image and return its corners; None if the image does not match
-    the drawing.
+    the drawing, or if the fit exceeds one of the limits below.
 
     The fit starts at `start_corners_px` (4, 2) in the distorted image with the initial blur
-    `initial_blur_sigma_px` (standard deviation). `max_motion_from_start_sides` limits the distance
-    of the fitted corners from the start, and `max_corner_sigma_sides` limits their standard
-    deviation; both are in side lengths. If `must_exclude_other_codewords` is True, the image must
-    also exclude every other codeword (`are_other_codewords_excluded`); set it to False if the other
-    marker already identifies this one.
+    `initial_blur_sigma_px` (standard deviation). The fitted corners may be at most
+    `max_motion_from_start_sides` side lengths away from the start (or 3 px, if that is more), and
+    their standard deviation must be below `max_corner_sigma_sides` side lengths. The shape and the
+    size of the fitted square must be plausible. If `must_exclude_other_codewords` is True, the
+    image must also exclude every other codeword (`are_other_codewords_excluded`); set it to False
+    if the other marker already identifies this one.
     """
     side_px = mean_side_px(start_corners_px)
     if not side_px >= MIN_MARKER_SIDE_PX:

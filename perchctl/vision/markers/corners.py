@@ -166,10 +166,12 @@ class RefinedCorners:
     Attributes:
         corners_px: corners (4, 2), px in the distorted image, in the order of cv2.aruco.
         sigma_px: standard deviation of each corner coordinate, px.
-        are_corners_fitted: True if the corners come from a line fit or a photometric fit; False if
-            they come from OpenCV or from the other marker, which is less accurate.
-        remaining_edge_shift_sigma_px: standard deviation, px, of the growth of white over black
-            that may remain in the corners, after the correction or without it.
+        are_corners_fitted: True if the corners come from a fit of lines, of the marker's drawing or
+            of the target's visible edges to the image; False if they come from OpenCV or from the
+            other marker, which is less accurate.
+        remaining_edge_shift_sigma_px: standard deviation, px, of the error that the growth of white
+            over black leaves in the position of each edge: of the correction's error, or of the
+            whole growth if it was not corrected.
         blurriest_side_blur_sigma_px, sharpest_side_blur_sigma_px: standard deviations of the
             Gaussian blur, px, of the marker's blurriest side and of its sharpest side.
         removed_edge_shift: an `EdgeShift`, for which the corners are corrected: the distance in

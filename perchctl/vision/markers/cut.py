@@ -215,8 +215,9 @@ def _make_target_outline(patterns: Mapping[MarkerName, MarkerPattern]) -> Target
 
 
 def _select_marker_to_report(pose_fit: PoseFit) -> MarkerName:
-    """Return the marker to report: the small one if enough of its edge points were found, otherwise
-    the large one."""
+    """Return which marker's corners are the result of `fit_truncated_markers`: the small marker if
+    at least 12 of its edge points were found (`_MIN_EDGE_POINTS_TO_REPORT_SMALL_MARKER`), otherwise
+    the large marker."""
     return (
         "small"
         if pose_fit.found_small_marker_edge_point_count >= _MIN_EDGE_POINTS_TO_REPORT_SMALL_MARKER
@@ -282,11 +283,11 @@ def _search_near_pose(
 
 
 def _is_pose_fit_reliable(pose_fit: PoseFit) -> bool:
-    """True if enough of the visible edge points were found (at least
-    `_MIN_FOUND_EDGE_POINT_FRACTION` of them), their RMS residual is below
-    `_MAX_TRUNCATED_FIT_RMS_RESIDUAL_PX`, and the standard deviation of the translation along its
-    most uncertain direction is below `_MAX_TRANSLATION_SIGMA_HALF_SIDES`, in half sides of the
-    large marker."""
+    """True if at least 75 % of the visible edge points were found
+    (`_MIN_FOUND_EDGE_POINT_FRACTION`), if their RMS residual is below 1.2 px
+    (`_MAX_TRUNCATED_FIT_RMS_RESIDUAL_PX`), and if the standard deviation of the translation along
+    its most uncertain direction is below 0.04 half sides of the large marker
+    (`_MAX_TRANSLATION_SIGMA_HALF_SIDES`)."""
     spread = math.sqrt(
         max(
             float(np.linalg.eigvalsh(pose_fit.rotation_translation_cov_rad_half_sides[3:, 3:])[-1]),
@@ -354,19 +355,20 @@ _MIN_VISIBLE_NODES_ON_PAPER = 200  # Minimum number of visible nodes on the pape
 
 @dataclass(frozen=True, eq=False)
 class CoarseLattice:
-    """A regular grid of nodes (rows, columns) in normalised image coordinates, at which images are
-    sampled without lens distortion. An image is first reduced in size and then sampled at two by
-    two points around each node, whose mean is the grey value of the node.
+    """A regular grid of points (nodes), in rows and columns, in normalised image coordinates. The
+    image's grey values at the nodes make a downsampled image without lens distortion, in which the
+    target's drawing is searched for. An image is first reduced in size; the grey value of a node is
+    then the mean of two by two samples around it.
 
     Attributes:
-        first_node_xy_normalised: x and y of the first node, (2,).
+        first_node_xy_normalised: x and y of the node in the first row and column, (2,).
         node_spacing_normalised: distance between neighbouring nodes.
         valid_lens_radius_normalised: distance from the optical axis up to which the lens model is
             used; further out, it may map two directions to the same pixel.
-        sample_x_in_reduced_image_px, sample_y_in_reduced_image_px: maps for cv2.remap (2 rows, 2
-            columns): x and y of each sample point, px in the reduced image.
+        sample_x_in_reduced_image_px, sample_y_in_reduced_image_px: maps for cv2.remap, each of
+            shape (2 * rows, 2 * columns): x and y of each sample, px in the reduced image.
         reduced_image_width_height_px: width and height of the reduced image.
-        is_node_in_image: True for nodes inside the image, (rows, columns).
+        is_node_in_image: True for nodes inside the camera's image, (rows, columns).
     """
 
     first_node_xy_normalised: Array
@@ -380,9 +382,9 @@ class CoarseLattice:
 
 @dataclass(frozen=True, eq=False)
 class CoarseUndistortedImage:
-    """A downsampled, undistorted image: grey values `grey` (rows, columns), 0 to 255, at the nodes
-    of a lattice. `is_node_visible` (rows, columns) is True for nodes that are inside the camera
-    image and not hidden by the vehicle."""
+    """A downsampled image without lens distortion: `grey` (rows, columns) contains its grey values,
+    0 to 255, at the nodes of the regular grid `lattice`. `is_node_visible` (rows, columns) is True
+    for nodes that are inside the camera image and not hidden by the vehicle."""
 
     lattice: CoarseLattice
     grey: FloatImage
@@ -391,9 +393,11 @@ class CoarseUndistortedImage:
 
 @lru_cache(maxsize=8)
 def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
-    """Return the lattice that covers the camera's field of view, up to
-    `_MAX_VIEW_RADIUS_NORMALISED` from the optical axis in x and y. Its spacing corresponds to about
-    `_LATTICE_COLUMNS` nodes across the image."""
+    """Return the regular grid of points (nodes) at which `make_coarse_image` computes the grey
+    values of a downsampled image without lens distortion. The grid covers the camera's field of
+    view in normalised image coordinates, but at most 1.5 (`_MAX_VIEW_RADIUS_NORMALISED`) from the
+    optical axis in x and in y. The spacing is that of about 80 nodes across the image width
+    (`_LATTICE_COLUMNS`)."""
     w, h = camera.size_px
     s = np.linspace(0.0, 1.0, _BORDER_POINTS_PER_IMAGE_SIDE)
     low, high = np.zeros_like(s), np.ones_like(s)
@@ -443,9 +447,10 @@ def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
 def make_coarse_image(
     image: NDArray[np.uint8], camera: CameraModel, hidden_mask_u8: NDArray[np.uint8] | None = None
 ) -> CoarseUndistortedImage:
-    """Undistort the image (h, w) and downsample it to the nodes of the camera's lattice, about 80
-    across the image. Nodes at which `hidden_mask_u8` (h, w) is not zero are marked as not visible;
-    without a mask, all nodes inside the image are visible."""
+    """Return the image (h, w) without lens distortion, downsampled to a regular grid of nodes with
+    about 80 nodes across the image width (`make_coarse_lattice`). Nodes at which `hidden_mask_u8`
+    (h, w) is not zero are marked as not visible; without a mask, all nodes inside the image are
+    visible."""
     lattice = make_coarse_lattice(camera)
     seen = lattice.is_node_in_image
     if hidden_mask_u8 is not None:
@@ -652,8 +657,10 @@ def make_outline(
 
 @lru_cache(maxsize=8)
 def make_drawing_texture(drawing: MarkerDrawing) -> DrawingTexture:
-    """Render the target and its white paper, out to `PAPER_REACH_FROM_CENTRE_LARGE_HALF_SIDES` from
-    the centre. `drawing` is that of the large marker, with the small one in it."""
+    """Return an image of the target on its white paper, rendered from `drawing`, the drawing of the
+    large marker with the small one in it. The image is square and extends at least 1.25 half sides
+    of the large marker (`PAPER_REACH_FROM_CENTRE_LARGE_HALF_SIDES`) from the target's centre in x
+    and y."""
     axis = make_sampling_grid(
         _TEXTURE_SIZE_PX, PAPER_REACH_FROM_CENTRE_LARGE_HALF_SIDES
     ).node_positions_half_sides
@@ -775,17 +782,20 @@ class RigidPose:
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
-    """A fitted pose and its quality. A point counts as found if its weight in the fit is not zero.
+    """The pose of the target's drawing as fitted to its edges in the image, and the quality of the
+    fit.
 
     Attributes:
         pose: the pose of the drawing in the camera frame.
         rotation_translation_cov_rad_half_sides: covariance (6, 6) of small rotations of the drawing
             about its centre (rad) and of its translation (half sides of the large marker), each
             along the camera's x, y, z.
-        visible_edge_point_count: number of edge points of the drawing that are in the image.
+        visible_edge_point_count: number of edge points of the drawing that are in the image and not
+            hidden by the vehicle.
         found_edge_point_count: number of visible edge points at which the image has an edge that
             the robust fit did not reject as an outlier.
-        found_small_marker_edge_point_count: number of found points on the small marker.
+        found_small_marker_edge_point_count: number of these found points that are on the small
+            marker.
         rms_residual_px: RMS distance of the edges in the image from the edges of the drawing,
             weighted and corrected for the effect of the robust weights; at least 0.03.
     """
@@ -800,7 +810,8 @@ class PoseFit:
 
 @dataclass(frozen=True, eq=False)
 class _EdgePoints:
-    """The edge points of a target outline that are in the image.
+    """The edge points of a target outline that are in the image and not hidden by the vehicle, as
+    projected from a pose of the target.
 
     Attributes:
         points_px: points (n, 2) px in the distorted image.
@@ -989,7 +1000,7 @@ def _measure_edge_offsets(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return two values for each edge point: the distance (n,), px, of the edge in the image from
     its expected position along the point's normal, positive towards white; and whether an edge was
-    found (n,).
+    found (n,). If it was not, the distance is meaningless.
 
     An edge is the windowed centroid of the grey gradient on a profile that extends
     `profile_half_lengths_px` (n,), but at least 3 px, to both sides of the expected position. It
@@ -1023,11 +1034,15 @@ def _solve_gauss_newton_step(
     is_edge_found: NDArray[np.bool_],
     pose_and_edge_shift_change_from_start: Array,
 ) -> _GaussNewtonStep | None:
-    """Return one Gauss-Newton step with robust (Tukey) weights; None if the sum of the weights is
-    too small. `edge_offset_to_white_px` and `is_edge_found`, (n,), are the results of
-    `_measure_edge_offsets`. `pose_and_edge_shift_change_from_start` (7,) is the sum of the previous
-    steps: rotation (rad), translation (half sides of the large marker) and, always 0, edge shift
-    (px). The prior pulls the sum of all steps towards zero."""
+    """Return one Gauss-Newton step, with robust (Tukey) weights, for the target's pose and the
+    growth of white over black at all edges (the edge shift); None if the sum of the weights is
+    below 12. `edge_offset_to_white_px` and `is_edge_found`, (n,), are the results of
+    `_measure_edge_offsets`.
+
+    `pose_and_edge_shift_change_from_start` (7,) is the sum of the previous steps: rotation (rad)
+    and translation (half sides of the large marker). The prior pulls the sum of all steps towards
+    zero. The last element is always 0 because every step estimates the whole edge shift (px) anew.
+    """
     J, weight = (
         edge_points.normal_motion_jacobian_wrt_pose_and_shift,
         is_edge_found.astype(np.float64),

@@ -430,14 +430,15 @@ def _measure_edge_shift(
     """Measure by how many pixels white has grown over black, from the width of the black border of
     the marker with the widest cells. `line_nx_ny_c` (4m, 3) and `rms_residual_px` (4m,) are the
     results of `_fit_lines`; `corners_normalised` (m, 4, 2) are the intersections of these lines.
-    Returns None if `inner_edges` is None, and a growth of 0 with the prior's standard deviation if
-    no inner edge is usable.
+    Returns None if `inner_edges`, the border's inner edges, were not measured (None). If none of
+    them is usable, the result is a growth of 0 with the standard deviation of
+    `edge_shift_prior_sigma_px`.
 
     A growth by d moves the border's outer edges inwards, and its inner edges outwards, by d. If
     positions are divided by the measured distance of the outer edges from the marker's centre, an
     inner edge whose true position is r appears at r + d (1 + r), with d on the same scale. The
     function solves this equation for d, after a correction for a curled sheet, and combines the
-    result with the prior, whose mean is 0.
+    result with a prior with mean 0 and this standard deviation.
     """
     if inner_edges is None:
         return None
@@ -709,11 +710,15 @@ def measure_edges(
     camera: CameraModel,
     must_measure_inner_edges: bool,
 ) -> tuple[MeasuredEdges, MeasuredEdges | None]:
-    """Measure two sets of edges in the image: the outer edges of the black borders of all markers,
-    with 4m rows, of which rows 4 i to 4 i + 3 belong to marker i; and the four inner edges of the
-    border of the marker with the widest cells (`index_of_marker_with_widest_cells`). The inner
-    edges are None if `must_measure_inner_edges` is False or if that marker's cells are not wider
-    than `_MIN_CELL_TO_MEASURE_EDGE_SHIFT_PX`."""
+    """Measure two sets of edges in the image, and return them separately. The first are the outer
+    edges of the black borders of all m markers: 4m rows, of which rows 4 i to 4 i + 3 belong to
+    marker i. The second are the inner edges of the black border of one marker, the one with the
+    widest cells: 4 rows. Their distance from the outer edges shows how far white has grown over
+    black.
+
+    The inner edges are None if `must_measure_inner_edges` is False or if that marker's cells are
+    not wider than 6 px (`_MIN_CELL_TO_MEASURE_EDGE_SHIFT_PX`).
+    """
     starts, lengths_px, depth_px = (
         markers.corners_normalised,
         markers.side_lengths_px,
@@ -786,13 +791,15 @@ def find_neighbour_edges(
     cells_along_inner_edges: CellsAlongBorder,
     neighbour_distance_px: Array,
 ) -> NeighbourEdges:
-    """Find out at which profiles (scan lines across an edge) a parallel edge, one cell further in
-    or out, blurs into the measured one. `fractions_along_side` (rows, n) contains the positions of
-    the profiles as fractions of a side, 0 to 1; `neighbour_distance_px` (rows,) is the width of a
-    cell across the edge.
+    """Return for each profile (scan line across an edge) whether a parallel edge, one cell further
+    in or out, blurs into the measured edge, so that `locate_edges` can correct for it.
+    `fractions_along_side` (rows, n) contains the positions of the profiles as fractions of a side,
+    0 to 1; `neighbour_distance_px` (rows,) is the width of a cell across the edge.
 
-    The rows are the four outer edges of each marker in `cells_along_border`, then, if there are
-    four more, the inner edges of the border of the marker with `cells_along_inner_edges`.
+    The first rows are the outer edges of the borders, four for each marker in `cells_along_border`.
+    Four more rows may follow: the inner edges of one marker's border. `cells_along_inner_edges`
+    describes the cells of that marker. An inner edge cannot be located on profiles at which one of
+    the next two cells inside it is black.
     """
     has_inner_neighbour_f32, has_outer_neighbour_f32 = (
         np.zeros(fractions_along_side.shape, np.float32),
@@ -872,7 +879,8 @@ _MEDIAN_PRESERVING_FILL_PX: Floats = np.where(
 @dataclass(frozen=True, eq=False)
 class NeighbourEdges:
     """Neighbouring edges, parallel to the measured ones, that blur into them. Each row of the
-    arrays is one side of a marker, with n profiles (scan lines) across it.
+    arrays is one measured edge, the outer or inner edge of the black border at one side of a
+    marker, with n profiles (scan lines) across it.
 
     Attributes:
         neighbour_distance_px: distance of a neighbouring edge from the measured edge: the width of
@@ -880,8 +888,8 @@ class NeighbourEdges:
         has_inner_neighbour_f32, has_outer_neighbour_f32: 1.0 for each profile that has a
             neighbouring edge, of opposite contrast, one cell further in or one cell further out,
             and 0.0 for each other profile, (rows, n).
-        is_edge_locatable_per_profile: False for profiles on which the edge can't be located, (rows,
-            n).
+        is_edge_locatable_per_profile: False for profiles that must not be used because black cells
+            next to an inner edge interrupt or bend it, (rows, n).
     """
 
     neighbour_distance_px: Array
@@ -937,7 +945,8 @@ def locate_edges(
 
 
 class _EdgeProfiles:
-    """The grey gradients along all profiles, and precomputed values for locating edges in them."""
+    """The grey gradients along all profiles (scan lines across the edges), with methods that locate
+    the edge on each profile: first in a wide window, and then more accurately in a narrow one."""
 
     def __init__(
         self,
@@ -1096,12 +1105,13 @@ def _fit_robust_line(
 
 
 def median_per_row(values: Floats, is_usable: NDArray[np.bool_]) -> Floats:
-    """Return the median (rows,) of the usable values in each row; 0 for a row without any.
+    """Return approximately the median (rows,) of the usable values in each row; 0 for a row without
+    usable values, or without any in an odd column.
 
     `values` and `is_usable` have the shape (rows, 24), with one column for each profile of a side.
     For speed, unusable values are not removed but replaced by huge ones, negative in even columns
-    and positive in odd columns. These keep the median where it is if they are equally many. If they
-    are not, the result is a usable value near the median.
+    and positive in odd columns. If as many are negative as positive, the result is the upper
+    median. Otherwise, it is a usable value near the median.
     """
     values = np.where(is_usable, values, _MEDIAN_PRESERVING_FILL_PX)
     values.partition(PROFILES_PER_SIDE // 2, axis=1)

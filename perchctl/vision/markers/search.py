@@ -77,14 +77,23 @@ def search_for_markers(
     search_mode: SearchMode = "all",
     measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None = None,
 ) -> FoundMarkers:
-    """Search the window around the expected markers with OpenCV's detector. If markers are missing
-    in the window, search the whole image.
+    """Search for the target's markers with OpenCV's detector, and return at most one large and one
+    small marker, chosen by `choose_markers`.
 
-    With the `search_mode` "near_expected" or "expected_window", only the window is searched; these
-    two modes differ in the fits to blurred markers that follow. With "whole_sharp", only the whole
-    image is searched. Other modes search both. If several targets are found and none is expected,
-    the search returns the one closest to this vehicle's own target
-    (`measure_marker_to_own_target_distance_m`).
+    - If no marker is expected, with the `search_mode` "whole_sharp", or if line fits are disabled,
+      the whole image is searched.
+    - With "near_expected" or "expected_window", only a window around the expected markers is
+      searched. These two modes differ in the fits to blurred markers that follow.
+    - With any other mode, the window is searched first, and then the whole image if no marker was
+      found in the window.
+
+    If the window would cover nearly the whole image or be narrower than 16 px, the whole image is
+    searched instead of it (`make_search_window`).
+
+    `measure_marker_to_own_target_distance_m` returns the horizontal distance of a marker from the
+    position of this vehicle's own target, m, or infinity if it is too far away. If no marker is
+    expected, the closest candidates are chosen. It is None if this position is not to be taken into
+    account.
     """
     setup, image_shape = detector_input.setup, detector_input.image.shape
     whole = slice(0, image_shape[0]), slice(0, image_shape[1])
@@ -126,11 +135,14 @@ def search_half_size_image(
     measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None = None,
 ) -> FoundMarkers | None:
     """Search the window around the expected markers in an image of half the size, which takes 1 ms.
-    The corners returned are in pixels of the full-size image. The arguments are those of
-    `search_for_markers`. Return None if this search misses a marker that is expected to be
-    completely in view, if fewer than two markers are expected, if none of them is expected to be
-    completely in view, or if the sides of one that is are not longer than
-    `_MIN_MARKER_SIDE_TO_HALVE_IMAGE_PX`."""
+    Return the markers found, with corners in pixels of the full-size image. The arguments are those
+    of `search_for_markers`.
+
+    Return None without a search unless both markers are expected, at least one of them completely
+    in view, and the mean side of each one completely in view is longer than 60 px
+    (`_MIN_MARKER_SIDE_TO_HALVE_IMAGE_PX`). Also return None if fewer markers are found than are
+    expected to be completely in view.
+    """
     image_shape = detector_input.image.shape
     in_view = [quad for quad in expected_corners_px.values() if is_inside_image(quad, image_shape)]
     if (
@@ -231,16 +243,23 @@ def choose_markers(
     small_to_large_side_ratio: float,
     measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None = None,
 ) -> dict[MarkerName, Array]:
-    """Choose the target's markers from the decoded `candidates`, corners (4, 2) px, and return at
-    most one large and one small marker. The result is empty if it is not clear which candidates
-    belong to the target.
+    """Choose the target's markers from the decoded `candidates`, which contain a list of corners
+    (4, 2) px for each marker. Return the corners of at most one large and one small marker. The
+    first of these cases that applies determines the result:
 
-    A small marker with the right size and rotation in the centre of a large one confirms both
-    markers. Markers at expected positions take precedence over such a pair elsewhere. If no
-    position is expected (`expected_corners_px` is empty), the candidates closest to this vehicle's
-    own target are chosen (`measure_marker_to_own_target_distance_m`). Otherwise, a large marker
-    without a pair is chosen only if it is the only large one, and a small marker only if it is the
-    only candidate.
+    - A small marker has the right place, size and rotation inside a large one
+      (`nesting_error_to_tolerance_ratio`): this pair, unless it is far from the expected position
+      and another candidate is near it. Of several pairs, the one closest to the expected position
+      is chosen; if no position is expected, the one closest to this vehicle's own target; if that
+      is not known either, the one that fits best.
+    - A large marker is near its expected position: this one. Otherwise, a small one near its own.
+    - No position is expected, and `measure_marker_to_own_target_distance_m` is not None: the large
+      marker closest to this vehicle's own target, or the closest small one if there is no large
+      one.
+    - There is only one large marker, or no large and only one small marker: this one.
+    - Otherwise, the result is empty because it is not clear which candidates belong to the target.
+
+    `expected_corners_px` contains the expected corners (4, 2) px, if any.
     `small_to_large_side_ratio` is the side of the small marker divided by the side of the large
     one.
     """
@@ -292,11 +311,12 @@ def _sort_by_own_target_distance(
     candidates: Mapping[MarkerName, list[Array]],
     measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction,
 ) -> Mapping[MarkerName, list[Array]]:
-    """Return the candidates, sorted by their distance from the position of this vehicle's own
-    target, without those that are too far away to be this target.
+    """Return the candidates for each marker, closest to the position of this vehicle's own target
+    first, without those that are too far away to be this target. The given function returns a
+    candidate's horizontal distance from this position, m, or infinity if it is too far away.
 
-    A single candidate is kept at any distance, and so are all candidates if all are too far away:
-    the pipeline rejects them later and reports the reason.
+    If there is only one candidate in total, or if all are too far away, the candidates are returned
+    unchanged: the pipeline rejects them later and reports the reason.
     """
     if sum(map(len, candidates.values())) < 2:
         return candidates
@@ -311,11 +331,12 @@ def _sort_by_own_target_distance(
 def _pair_markers(
     candidates: Mapping[MarkerName, list[Array]], small_to_large_side_ratio: float
 ) -> list[tuple[float, int, int]]:
-    """Return the pairs of a large and a small marker that form a target, best first, at most one
-    for each large marker. Each pair consists of the nesting error
-    (`nesting_error_to_tolerance_ratio`), the index of the large marker, and the index of the small
-    marker in `candidates`. `small_to_large_side_ratio` is the side of the small marker divided by
-    the side of the large one."""
+    """Return the pairs of a large and a small marker in `candidates` that form a target, best
+    first, at most one for each large marker. Each pair consists of the distance of the small marker
+    from its expected place inside the large one, as a fraction of the allowed distance, 0 to 1
+    (`nesting_error_to_tolerance_ratio`), the index of the large marker in its list, and the index
+    of the small marker in its list. `small_to_large_side_ratio` is the side of the small marker
+    divided by the side of the large one."""
     large, small = candidates["large"], candidates["small"]
     pairs = [
         (nesting_error_to_tolerance_ratio(a, b, small_to_large_side_ratio), i, j)
