@@ -45,7 +45,7 @@ class Context:
     def vehicle_support(self) -> Support:
         """What supports the vehicle in this tick: the air, a surface that it presses against, the
         target's magnet, another object or the floor; UNKNOWN if the evidence does not prove one of
-        them. `true_for_s` tells for how long the condition that proves it has been true."""
+        them (`find_support`)."""
         return find_support(self.belief)
 
     def true_for_s(self, condition: Condition[Any]) -> float:

@@ -111,8 +111,9 @@ class HoverTimes:
         """Return the time, s, until a landing that takes `landing_duration_s` must begin; negative
         if it is overdue. It is the smaller of two times: until row `battery-low` lands the vehicle;
         and until the voltage in hover falls below `safety.min_load_v`, less `landing_duration_s`
-        and `reserve_s`. Low power does not stop the motors, so a landing may last beyond the first.
-        Only `TRUSTED_HOVER_TIME_FRACTION` of each predicted time is counted."""
+        and `reserve_s`. The landing is not subtracted from the time until `battery-low`, since the
+        motors keep running at low power. Only `TRUSTED_HOVER_TIME_FRACTION` of each predicted time
+        is counted."""
         return min(
             TRUSTED_HOVER_TIME_FRACTION * self.until_battery_low_s,
             TRUSTED_HOVER_TIME_FRACTION * self.until_min_load_voltage_s
@@ -230,8 +231,10 @@ def is_charge_too_low_for_any_attempt(c: Context) -> bool:
 
 
 def battery_shortfall_text(c: Context) -> str:
-    """Return a message with the time left for attempts and the times that an attempt, the landing
-    and the reserve need."""
+    """Return a message with the time left before a landing must begin, or that it is unknown, and
+    the times that an attempt, the landing and the reserve need. It is the reason to land once the
+    charge is too low for an attempt, and does not check that again. The position of the target must
+    be known."""
     predicted = predict_mission_durations(c)
     has = "the remaining battery time is unknown"
     if c.state.battery.hover_time_left_s is not None:

@@ -18,9 +18,10 @@ def update_state_with_observation(
     """Return the planner's state with its belief updated by the observation `obs`; no decision is
     made. `maneuver` is the one that the vehicle is flying.
 
-    After a gap without ticks, the phase's conditions restart, and if a falling vehicle was being
-    caught, the catch ends and its setpoint is deleted. After a jump of the estimated position, the
-    positions that the state remembers are shifted by the same amount.
+    After a gap without ticks, the conditions of the phase must last for their whole time again, and
+    if a falling vehicle was being caught, the catch ends and its setpoint is deleted. After a jump
+    of the estimated position, the positions that the state remembers are shifted by the same
+    amount.
     """
     if has_tick_gap(state.belief, obs, profile):
         # The setpoint of a catch is far above the vehicle; keeping it would make the vehicle press

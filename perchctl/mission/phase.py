@@ -94,8 +94,9 @@ class Severity(IntEnum):
     STOP = 4
 
     def escalate(self, new_severity: Severity) -> Severity:
-        """Return the flight's severity after a transition of severity `new_severity`: that of the
-        transition, or the higher of both if this one is `LAND` or `STOP`."""
+        """Return the flight's severity after a transition of severity `new_severity`; `self` is the
+        severity before it. The result is `new_severity`, or the higher of both if `self` is already
+        `LAND` or `STOP`."""
         return max(self, new_severity) if self >= Severity.LAND else new_severity
 
 

@@ -109,13 +109,16 @@ def end_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
 
 
 def reduce_press_before_weight_transfer(c: Context) -> Action:
-    """Perform the first stage of the release, which transfers the weight from the rotors to the
-    magnet.
+    """Return the state and the command of the first stage of the release: the press against the
+    target is reduced so that the magnet takes over the vehicle. The caller starts the second stage
+    (`transfer_weight_by_raw_thrust`) once measurements show that the magnet holds.
 
-    Lower the setpoint in steps to `complete.release_drop_m` below the contact until the
-    measurements show that the magnet carries the vehicle; if the press has lasted longer than
-    `MAX_PRESS_DURATION_FOR_GRADUAL_RELEASE_S`, take all steps at once. In a press by raw thrust,
-    which winds up no integrator, lower the thrust to just below the holding thrust instead.
+    In a press by position setpoint, the setpoint is lowered in `complete.steps` steps to
+    `complete.release_drop_m` below the contact, or at once if the press has lasted longer than
+    `MAX_PRESS_DURATION_FOR_GRADUAL_RELEASE_S`. In a press by raw thrust, which winds up no
+    integrator, the thrust is lowered in the same steps to just below the largest thrust that proves
+    that the magnet holds the vehicle; with old telemetry, the vehicle is held by position control
+    instead (`hold_contact_by_position`).
     """
     complete, perch, state, b = c.planner.complete, c.planner.perch, c.state, c.belief
     step = min(complete.steps, 1 + int(c.time_in_phase_s / complete.release_s * complete.steps))
@@ -147,8 +150,10 @@ def reduce_press_before_weight_transfer(c: Context) -> Action:
 
 
 def transfer_weight_by_raw_thrust(c: Context, *, max_stale_telemetry_age_s: float = 0.0) -> Action:
-    """Perform the second stage of the release: reduce raw thrust until the motors stop turning, and
-    command the motor stop once the support has carried the whole weight for long enough.
+    """Return the state and the command of the second stage of the release: raw thrust is reduced
+    until the motors stop turning, and the motor stop is commanded once the vehicle has hung for
+    `complete.hang_s` with motors that no longer turn. If the reported thrust does not follow the
+    commanded one, it must hang longer, by `EXTRA_HANGING_DWELL_IF_THRUST_UNCONFIRMED_S`.
 
     While the telemetry is not fresh and older than `max_stale_telemetry_age_s`, hold the vehicle by
     position control instead; the stage then starts over. With 0, any telemetry that is not fresh

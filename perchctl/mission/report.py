@@ -182,10 +182,12 @@ class HoverReport:
 
 @dataclass(frozen=True)
 class FlightReport:
-    """How a flight ended: its last phase, outcome and reason, the number of attempts, the duration,
-    s, whether the firmware's supervisor has locked the vehicle, the events, and findings about
-    camera, contact, touchdown and hover. Each finding is None if it is unknown or does not
-    apply."""
+    """How a flight ended: its last phase, outcome and reason, the number of attempts that failed or
+    succeeded, the duration, s, whether the firmware's supervisor has locked the vehicle, and the
+    events of the flight (`history`). Findings about the camera, the horizontal distance between
+    gear and target of a hanging vehicle, the touchdown and the newest hover follow, each None if it
+    is unknown or does not apply. `detached_watcher_messages` has one sentence for each observer of
+    the flight (log, panel or callback) that raised an exception and was not called again."""
 
     phase: Phase
     outcome: Outcome

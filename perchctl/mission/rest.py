@@ -26,9 +26,10 @@ come off."""
 
 
 class RestState(Enum):
-    """Where a vehicle with its motors off rests: on the magnet, held elsewhere, on the floor, or
-    unknown; `END_UNCONFIRMED` if not even the end of the flight could be confirmed. Each value is a
-    phrase without a full stop."""
+    """Where a vehicle with its motors off rests: hanging on the target's magnet (`HANGS`), held by
+    another object (`HELD`), on the floor (`STANDS`), or either hanging or on the floor (`UNKNOWN`).
+    `END_UNCONFIRMED` means that telemetry did not confirm that the flight has ended, so the motors
+    may still be running. Each value is a phrase without a full stop."""
 
     HANGS = "the vehicle is hanging on the magnet with its motors off"
     HELD = "something holds the vehicle in place, away from the target; the motors are off"
@@ -38,19 +39,19 @@ class RestState(Enum):
 
 
 def find_rest_state(c: Context) -> RestState:
-    """Return where the vehicle rests; only valid once the motors are off. The result is HELD if,
-    during a landing, an object other than the target holds the vehicle.
+    """Return where the vehicle rests; only valid once the motors are off. The first case that
+    applies decides:
 
-    If a deck or motion capture gives a valid position and the vehicle has not been restarted, its
-    height decides. It HANGS if the target is not known to be too far above to hold it, and either
-    it has come down by less than `MAX_HEIGHT_LOSS_IF_STILL_HANGING_M` since the phase began high
-    above the ground, or it has a recorded contact and is higher than
-    `MAX_HEIGHT_RESTING_ON_FLOOR_M` above the ground. Otherwise, it STANDS.
-
-    In all other cases, it STANDS if a tracked target is too far above to hold it; otherwise, the
-    falls that the accelerometer has measured decide (`_find_rest_state_from_measured_falls`). After
-    a restart, the position estimate starts again at the origin, so earlier positions and sightings
-    are not used.
+    - An object other than the target holds the vehicle during a landing: HELD.
+    - No deck or motion capture gives a valid position, or the vehicle has been restarted: STANDS if
+      a tracked target is too far above to hold it; otherwise, the falls that the accelerometer has
+      measured decide (`_find_rest_state_from_measured_falls`). After a restart, the position
+      estimate starts again at the origin, so earlier positions and sightings are not used.
+    - All other cases: HANGS if the target is not known to be too far above to hold the vehicle, and
+      the height shows that it has not come down. This is so if it has lost less than
+      `MAX_HEIGHT_LOSS_IF_STILL_HANGING_M` of height in the present phase, which began more than
+      `MIN_HEIGHT_TO_INFER_HANGING_M` above the ground, or if a contact is recorded and it is more
+      than `MAX_HEIGHT_RESTING_ON_FLOOR_M` above the ground. STANDS otherwise.
     """
     b, state = c.belief, c.state
     if _is_held_by_other_object(c):
@@ -107,8 +108,8 @@ def _is_held_by_other_object(c: Context) -> bool:
 def _find_rest_state_from_measured_falls(c: Context) -> RestState:
     """Return the rest state from the falls that the accelerometer has measured: HANGS if the
     vehicle has come within the magnet's reach and has neither fallen nor reached the floor since,
-    otherwise STANDS. The state is UNKNOWN if a gap in the telemetry was long enough to hide the
-    opposite: a fall, or a catch by the magnet."""
+    otherwise STANDS. Return UNKNOWN instead if a gap in the telemetry may hide an event that makes
+    this wrong: for HANGS a fall, and for STANDS a catch by the magnet."""
     b, dead_reckoning, since_s = (
         c.belief,
         c.belief.dead_reckoning,

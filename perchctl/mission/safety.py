@@ -186,7 +186,9 @@ def _lateral_distance_from_setpoint_m(c: Context) -> float:
 
 def position_control_divergence_reason(c: Context) -> str:
     """Return a message that says how position control diverges (vertical oscillation, distance from
-    the setpoint, or a velocity that contradicts the accelerometer), and the possible causes."""
+    the setpoint, or a velocity that contradicts the accelerometer), and the possible causes. It is
+    the reason to land once `is_position_control_diverging` is true, and does not check that
+    again."""
     b = c.belief
     if _is_oscillating_vertically(c):
         return (
@@ -246,8 +248,11 @@ def is_outside_fleet_corridor(c: Context) -> bool:
 
 
 def wrong_camera_latency_reason(c: Context) -> str:
-    """Return a message with the measured age of the pictures and the age that was expected; with
-    late telemetry, with the disagreement of their times instead."""
+    """Return a message with the measured age of the pictures and, if the profile sets the latency,
+    that latency; otherwise, the range of latencies that can be measured in flight. If the telemetry
+    is late, the message says instead by how much the times of pictures and telemetry disagree. It
+    is the reason to land once pictures and accelerometer have shown that the latency is wrong, and
+    does not check that again."""
     camera, b = c.profile.camera, c.belief
     assumed_s = camera.start_latency_s + c.obs.camera_latency_above_profile_s
     error_s = b.camera_imu_mismatch.camera_latency_error_s
@@ -283,7 +288,9 @@ def is_camera_mounting_contradicted(c: Context) -> bool:
 
 
 def wrong_camera_mounting_reason(c: Context) -> str:
-    """Return a message that says how the camera seems to be mounted, and what to do."""
+    """Return a message that says how the camera seems to be mounted (rotated relative to the
+    profile, or not pointing up), and what to check or correct. It is the reason to land once
+    `is_camera_mounting_contradicted` is true, and does not check that again."""
     b = c.belief
     turn_rad = b.camera_imu_mismatch.camera_yaw_error_rad
     if turn_rad or b.mounting.is_camera_mounting_wrong:
@@ -345,15 +352,17 @@ def is_thrust_insufficient_for_takeoff(c: Context) -> bool:
 
 
 def is_thrust_insufficient_to_fly_or_press(c: Context) -> bool:
-    """True if too little thrust remains to keep flying or to press, as measured or as predicted.
-    Measured: the vehicle has not climbed at full thrust for `NOT_CLIMBING_AT_FULL_THRUST_DWELL_S`,
-    or has hardly climbed at nearly full thrust for `SLOW_AT_NEARLY_FULL_THRUST_DWELL_S`. In an
-    ascent, only the first counts, since a weak vehicle that can perch climbs the last part slowly.
-    Predicted, at the stand-off before the press: hover thrust exceeds
-    `MIN_SATURATED_TO_FULL_THRUST_RATIO` times the largest press thrust.
+    """True if too little thrust remains to keep flying or to press. Any of these shows it:
 
-    A mission that hovers does not press, so nothing is predicted for it. False while a press is
-    being ended.
+    - The vehicle has not climbed at full thrust for `NOT_CLIMBING_AT_FULL_THRUST_DWELL_S`.
+    - The vehicle has hardly climbed at nearly full thrust for `SLOW_AT_NEARLY_FULL_THRUST_DWELL_S`.
+      This does not count in ASCEND, since a weak vehicle that can perch climbs the last part
+      slowly.
+    - At the stand-off before a press, hover thrust exceeds `MIN_SATURATED_TO_FULL_THRUST_RATIO`
+      times the largest press thrust. A mission that hovers does not press, so this does not apply
+      to it.
+
+    Always False while a press is being ended.
     """
     if c.state.must_end_press:
         return False

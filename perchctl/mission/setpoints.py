@@ -113,9 +113,10 @@ def step_setpoint_towards(
 ) -> PositionSetpoint:
     """Return the setpoint of the next tick: `old`, moved towards `goal` with a speed of at most
     `max_up_mps` upwards, `max_down_mps` downwards and `align.speed_mps` laterally, and turned at no
-    more than `align.yaw_rate_dps`. With `limits_speed_until_camera_mounting_confirmed`, the lateral
-    speed is lower while the camera's mounting is unconfirmed, and zero without a fresh target. If
-    `changes_heading` is False, the heading stays."""
+    more than `align.yaw_rate_dps`. If `limits_speed_until_camera_mounting_confirmed` is True and
+    the camera's mounting is still unconfirmed, the lateral speed is at most
+    `MAX_LATERAL_SPEED_WITH_UNCONFIRMED_CAMERA_MOUNTING_MPS`, and zero if the camera has not seen
+    the target recently. If `changes_heading` is False, the heading stays."""
     dt_s, align = c.t_s - c.state.t_s, c.planner.align
     xy_mps, yaw_radps = align.speed_mps, math.radians(align.yaw_rate_dps)
     if not changes_heading:
@@ -141,9 +142,10 @@ def step_setpoint_towards(
 
 
 def fly_to(c: Context, reference: PositionSetpoint, *, corrects_height: bool = True) -> Action:
-    """Store the setpoint `reference`, where the vehicle should be, and send a setpoint that brings
-    it there in spite of wind and onboard control errors (`correct_setpoint`). Without
-    `corrects_height`, the height sent is that of `reference`."""
+    """Return the state and the command that bring the vehicle to `reference`. The state stores
+    `reference` as its setpoint. The command is that setpoint, corrected for wind and onboard
+    control errors (`correct_setpoint`) and kept inside the fence and the height limits. If
+    `corrects_height` is False, the height is not corrected."""
     return replace(c.state, setpoint=reference), limit_setpoint_to_fence_and_height_range(
         c, correct_setpoint(c, reference, corrects_height=corrects_height)
     )
@@ -199,12 +201,12 @@ def update_lateral_integral(
 
 
 def move_setpoint_to_vehicle(c: Context) -> PlannerState:
-    """Return the state with its setpoint moved to the vehicle's position, if the vehicle is
-    hovering in place. The integral absorbs the difference, so that the command that is sent does
-    not jump.
+    """Return the state for a landing that keeps the learned wind correction. If the vehicle is
+    hovering in place, x and y of the setpoint become those of the vehicle, and the lateral integral
+    absorbs the difference, so that the command that is sent does not jump.
 
-    A moving vehicle keeps its setpoint and integral. Without a setpoint, or with diverged
-    positions, the integral becomes zero.
+    If there is no setpoint or positions have diverged, only the integral changes: it becomes zero.
+    Otherwise, a vehicle that is moving or has no valid position keeps its setpoint and integral.
     """
     reference, (x_m, y_m, _) = c.state.setpoint, c.telemetry.position_m
     if reference is None or c.belief.is_position_diverged:

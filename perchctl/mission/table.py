@@ -65,9 +65,9 @@ def find_first_matching_transition(
     stays in its phase. A row applies if the present phase is one of its phases and its `when` is
     true. Once the mission is landing, rows to a phase before the landing are skipped.
 
-    This is the first row that applies, with one exception. If that row keeps the mission in its
-    phase (a wait), a later row with a severity above `CONTINUE` (normal progress) that applies and
-    is no wait is returned instead, so that a wait delays only normal progress.
+    The first row that applies decides, unless it makes the mission wait in its phase. A wait delays
+    only normal progress (severity `CONTINUE`): the first later row that applies, has a higher
+    severity and is not a wait itself then decides instead, if there is one.
     """
     landing, phase = c.state.severity >= Severity.LAND, c.state.phase
     waits: Transition | None = None
@@ -173,12 +173,13 @@ def _wrap_errors_with_row_name(
 
 
 def load_table(extension_name: str | None) -> tuple[Transition, ...]:
-    """Return the table of one flight: the built-in one, with your own rows if the profile's
-    `planner.rows` names them.
+    """Return the transition table of one flight: the built-in one, extended by your own rows
+    (`add_rows`) if the profile's `planner.rows` names them.
 
-    `extension_name` is ``module:attribute`` of the rows, or of a function that returns them; None
-    for the built-in table. Raises NotFound if there is no such attribute, and InvalidValue as
-    `add_rows` does.
+    `extension_name`, the value of `planner.rows`, is ``module:attribute`` of the rows, or of a
+    function that returns them; with None, the result is the built-in table. Raises NotFound if
+    there is no such attribute, and InvalidValue if the function raises an exception or `add_rows`
+    rejects a row.
     """
     if extension_name is None:
         return TABLE

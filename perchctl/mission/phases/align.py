@@ -47,8 +47,9 @@ CLIMB_WITHHELD = Condition[Context](
 
 
 def act_in_align(c: Context) -> Action:
-    """Move under the target at the height of the present setpoint or, without one, of the
-    vehicle."""
+    """Return the state and the command that move the vehicle under the target and turn it to the
+    target's heading. The height stays that of the present setpoint or, without a setpoint, that of
+    the vehicle."""
     return fly_under_target(c, (c.state.setpoint or make_setpoint_at_vehicle(c)).z_m)
 
 
@@ -94,7 +95,8 @@ def is_planned_hover_height_unsafe(c: Context) -> bool:
 
 def unsafe_hover_height_reason(c: Context) -> str:
     """Return a message with the height at which the vehicle would hover and the range of allowed
-    heights, both above the ground. Only valid in a mission that hovers."""
+    heights, both above the ground. It is the reason to land once `is_planned_hover_height_unsafe`
+    is true, and does not check that again. Only valid in a mission that hovers."""
     hover, height_m = c.planner.hover, planned_hover_height_above_ground_m(c)
     assert hover is not None
     assert height_m is not None

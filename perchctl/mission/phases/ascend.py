@@ -90,9 +90,11 @@ def _is_settled_at_standoff(c: Context) -> bool:
 
 
 def _is_at_hover_position(c: Context) -> bool:
-    """True if the vehicle is slow, and its gear is aligned below a fresh target at the distance at
-    which the mission hovers. The tolerances are those of ALIGN, since the small marker may be too
-    far away to be seen."""
+    """True if the vehicle is slow, its gear and its setpoint are at the height at which the mission
+    hovers (within `HOVER_HEIGHT_TOLERANCE_M` and `HOVER_SETPOINT_HEIGHT_TOLERANCE_M`), and the
+    camera has seen the target recently. The gear's lateral offset from the target's axis and the
+    heading must be within the tolerances of ALIGN; those of the stand-off do not apply, since the
+    small marker may be too far away to be seen."""
     align, target, setpoint = c.planner.align, c.belief.target, c.state.setpoint
     goal_z_m = target.vehicle_world_z_when_touching_m - ascent_end_distance_below_target_m(c)
     return (
@@ -117,9 +119,10 @@ def is_returning_to_hover_height(state: PlannerState) -> bool:
 
 
 def is_target_lost(c: Context) -> bool:
-    """True if the target is no longer tracked and was last seen more than
-    `MAX_TARGET_OUT_OF_VIEW_DURATION_S` ago. If the target itself is the positioning system, any
-    time without tracking is too long, since the position drifts."""
+    """True if the target is no longer tracked (it is not visible, and the filter has stopped
+    predicting it) and was last seen more than `MAX_TARGET_OUT_OF_VIEW_DURATION_S` ago. If the
+    target itself is the position source, the vehicle's position drifts without sightings, so the
+    target counts as lost as soon as it is no longer tracked."""
     b = c.belief
     patience_s = 0.0 if b.is_target_position_source else MAX_TARGET_OUT_OF_VIEW_DURATION_S
     return not b.target.is_tracked and b.target.age_s > patience_s

@@ -45,8 +45,12 @@ def enter_complete(state: PlannerState, previous_context: Context) -> PlannerSta
 
 
 def act_in_complete(c: Context) -> Action:
-    """Transfer the weight from the rotors to the magnet in two stages (the release), stop the
-    motors once the magnet carries the whole weight, and monitor the vehicle."""
+    """Return the state and the command that transfer the weight from the rotors to the magnet and
+    then stop the motors. The press is reduced until the measurements have shown for
+    `complete.hold_dwell_s` that the magnet holds the vehicle
+    (`reduce_press_before_weight_transfer`). Then raw thrust is reduced until the magnet carries the
+    whole weight and a motor stop is commanded (`transfer_weight_by_raw_thrust`). After that,
+    `stop_motors` repeats the stop command."""
     if c.state.motor_stop_commanded_at_s is not None:
         return stop_motors(c)
     holds = c.true_for_s(MAGNET_HOLDS_VEHICLE) >= c.planner.complete.hold_dwell_s

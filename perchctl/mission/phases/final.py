@@ -19,10 +19,11 @@ def stay_idle(c: Context) -> Action:
 
 
 def act_in_aborted(c: Context) -> Action:
-    """In the first tick of ABORTED, return the stop command of the transition or, if it has none,
-    `StopMotors` if the raw thrust has already been ramped down or the descent has reached its end.
-    Without `StopMotors`, the firmware would then lock a vehicle whose setpoints end. Return `Idle`
-    (nothing is sent) in all other cases and in all later ticks."""
+    """Return the state and the command of one tick in ABORTED. In the first tick, the command is
+    the stop command of the transition into ABORTED. If that has none, the command is `StopMotors`
+    if the raw thrust has been ramped down or the descent has reached its end; without this command,
+    the firmware would lock the vehicle when its setpoints end. In all other cases and in all later
+    ticks, it is `Idle`: nothing is sent."""
     if c.state.stop_or_land_command_count:
         return c.state, Idle()
     ends = (

@@ -61,15 +61,17 @@ def is_hovering(state: PlannerState) -> bool:
 
 
 def time_since_hover_began_s(c: Context) -> float:
-    """Return the time since the hover began, s."""
+    """Return the time since the newest hover began, s, including short climbs back to the hover
+    position (`enter_hover`). Only valid once a hover has begun."""
     return c.t_s - c.state.hover_errors.hover_began_at_s
 
 
 def enter_hover(state: PlannerState, previous_context: Context) -> PlannerState:
-    """Restart the hover timer and the position errors, unless `previous_context`, the context
-    before the transition in the same tick, shows that the vehicle has only climbed back to its
-    hover position, in at most `MAX_HEIGHT_RETURN_DURATION_TO_KEEP_HOVER_TIMER_S`. Timer and errors
-    then continue."""
+    """Return the state with the hover timer and the statistics of the position errors restarted. If
+    the vehicle has only climbed back to its hover position, in at most
+    `MAX_HEIGHT_RETURN_DURATION_TO_KEEP_HOVER_TIMER_S`, return the state unchanged, so that both
+    continue. `previous_context`, the context before the transition in the same tick, shows whether
+    it has."""
     if (
         is_returning_to_hover_height(previous_context.state)
         and previous_context.time_in_phase_s <= MAX_HEIGHT_RETURN_DURATION_TO_KEEP_HOVER_TIMER_S
@@ -103,7 +105,9 @@ def has_left_hover_position(c: Context) -> bool:
 
 
 def left_hover_position_reason(c: Context) -> str:
-    """Return a message that says how far the vehicle is from its hover position."""
+    """Return a message that says how far the gear is from its hover position, to the side and up or
+    down. It is the reason to align again once `has_left_hover_position` is true, and does not check
+    that again."""
     aside_m, below_m = (
         c.belief.target.gear_to_target_distance_xy_m,
         distance_below_hover_height_m(c),

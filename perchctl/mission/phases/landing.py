@@ -20,15 +20,16 @@ vehicle, s."""
 
 
 def enter_landing(state: PlannerState, previous_context: Context) -> PlannerState:
-    """Start the descent as the diagnosis of the transition into LANDING requires.
-    `previous_context` is the context before the transition, in the same tick.
+    """Return the state with which the landing begins. `previous_context` is the context before the
+    transition, in the same tick. `state.entry.diagnosis` holds what the transition asserts about
+    the vehicle:
 
-    The descent does not use positions if the diagnosis says that the external positions are wrong,
-    or if it says that the camera's mounting is wrong and, in a flight by motion capture, the target
-    moved with the vehicle: the axes of the positions may be wrong instead. With a wrong mounting,
-    the setpoint is dropped. If the previous phase was RECOVER, the recorded distance between gear
-    and target at the last touch is deleted, unless the diagnosis says that the vehicle is hanging
-    there.
+    - The external positions are wrong: the descent does not use positions.
+    - The camera's mounting is wrong: the setpoint is deleted, since it may lead the vehicle in the
+      wrong direction. If, in a flight by motion capture, the target moved with the vehicle, the
+      axes of the positions may be wrong instead, so the descent does not use positions either.
+    - The vehicle is hanging at its last touch: the recorded distance between gear and target at
+      that touch is kept. Otherwise, it is deleted if the previous phase was RECOVER.
     """
     diagnosis, b = state.entry.diagnosis, state.belief
     # The mounting may be right and the axes of the motion capture wrong. Position control would
@@ -64,7 +65,9 @@ def make_rest_state_predicate(rest_state: RestState) -> Predicate:
 
 
 def unconfirmed_landing_reason(c: Context) -> str:
-    """Return why the landing could not be confirmed, as far as the telemetry shows."""
+    """Return a message that says that the landing was not confirmed in time, and why: the telemetry
+    is too old, still shows the vehicle flying, or does not yet show it at rest. It is the reason to
+    end the flight once `landing.timeout_s` has passed."""
     age_s, proof_age_s = c.belief.attitude_age_s, c.safety.proof_age_s
     if age_s > FRESH_S:
         cause = f"the newest telemetry is {age_s:.1f} s old"

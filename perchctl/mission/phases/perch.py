@@ -65,8 +65,9 @@ def is_contact_proven(c: Context) -> bool:
 
 
 def contact_evidence_text(c: Context) -> str:
-    """Return a message that names the evidence for the contact and tells how far the gear is from
-    the target's axis."""
+    """Return a message for the moment at which the contact is proven (`is_contact_proven`, which is
+    not checked again). It names the evidence (acceleration and thrust, and the position if that is
+    valid) and the horizontal distance of the gear from the target's axis."""
     by = "position, acceleration and thrust"
     if not c.belief.is_position_valid:
         by = f"acceleration and thrust ({position_loss_text(c.belief)})"

@@ -54,10 +54,11 @@ STEADY_AFTER_ATTEMPT = Condition[Context](
 
 
 def enter_recover(state: PlannerState, previous_context: Context) -> PlannerState:
-    """Record the last touch and the height of a contact or obstacle, and prepare a catch if the
-    vehicle has slipped off its contact with too little thrust to carry most of its weight. The
-    measurements are those of `previous_context`, the context before the transition in the same
-    tick."""
+    """Return the state at the start of RECOVER. It records the horizontal distance between gear and
+    target at the last touch, the vehicle's world z at a contact or obstacle, and, if the vehicle
+    has slipped off its contact with too little thrust to carry most of its weight, how far above
+    the vehicle a setpoint must be to catch it. The measurements are those of `previous_context`,
+    the context before the transition in the same tick."""
     old, b, diagnosis = previous_context.state, previous_context.belief, state.entry.diagnosis
     z_m, thrust = b.telemetry.position_m[2], b.telemetry.thrust
     touched = old.phase is Phase.PERCH or VehicleDiagnosis.BLOCKED_BY_OBSTACLE in diagnosis
@@ -91,13 +92,14 @@ def enter_recover(state: PlannerState, previous_context: Context) -> PlannerStat
 def _find_gear_to_target_at_touch(
     previous_context: Context, diagnosis: VehicleDiagnosis
 ) -> GearToTargetDistance | None:
-    """Return the distance between gear and target at the touch that ended the attempt; None if no
-    touch is known. `previous_context` is the context before the transition into RECOVER, in the
-    same tick, and `diagnosis` is what the transition asserts.
+    """Return the horizontal distance between gear and target at the touch that ended the attempt;
+    None if no touch is known. `previous_context` is the context before the transition into RECOVER,
+    in the same tick, and `diagnosis` is what the transition asserts.
 
-    If the vehicle is still at its contact, the recorded distance is returned. A press counts as a
-    touch only if, at the target's height, a contact was proven or accelerometer and thrust showed
-    support.
+    If the vehicle has not left its contact since an earlier touch, the distance recorded at that
+    touch is returned. Otherwise, only a press in PERCH at the target's height counts as a touch,
+    and only if the contact was proven or accelerometer and thrust showed support; the distance is
+    then the present one.
     """
     old, b = previous_context.state, previous_context.belief
     # the contact was proven, and the vehicle has not come off
@@ -164,8 +166,10 @@ def has_recovered(c: Context) -> bool:
 
 
 def unsteady_reason(c: Context) -> str:
-    """Return a message that lists the measurements by which the vehicle was judged unsteady. The
-    message gives no causes."""
+    """Return a message that says that the vehicle is not steady `recover.timeout_s` after an
+    attempt. It lists the speed, the horizontal distance from the setpoint and a contact that the
+    vehicle has not left, each only if known, and gives no causes. It is the reason to land at that
+    timeout."""
     b, setpoint = c.belief, c.state.setpoint
     seen = [f"moving at {b.speed_mps:.2f} m/s"] if math.isfinite(b.speed_mps) else []
     if b.is_position_valid and setpoint is not None:

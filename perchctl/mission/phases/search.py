@@ -94,7 +94,8 @@ def _limit_move_before_camera_mounting_check(
 
 def target_not_found_reason(c: Context) -> str:
     """Return a message that says that the target was not found, and why if known: the camera's
-    problem or, without one, why a sighting was refused."""
+    problem or, without one, why a sighting was refused. It is the reason to land once all
+    `search.attempts` steps of the search have been used."""
     text, why = "target not found in the allowed attempts", c.obs.camera_problem
     why = why or c.obs.target_refusal_reason
     return f"{text}: {why}" if why else text
