@@ -218,9 +218,10 @@ def valid_gear_to_target_at_last_contact(b: Belief) -> GearToTargetDistance | No
 
 
 def gear_to_target_at_last_contact_or_now(b: Belief) -> GearToTargetDistance:
-    """Return the gear's distance from the target's axis at the last touch, while the vehicle
-    retreats from an attempt (`valid_gear_to_target_at_last_contact`), otherwise the present
-    distance (`current_gear_to_target`)."""
+    """Return the gear's distance from the target's axis at the last touch if it is still valid,
+    which is only possible while the vehicle retreats from an attempt
+    (`valid_gear_to_target_at_last_contact`), otherwise the present distance
+    (`current_gear_to_target`)."""
     return valid_gear_to_target_at_last_contact(b) or current_gear_to_target(b)
 
 
@@ -292,8 +293,7 @@ def is_flying_at_hover_thrust(b: Belief) -> bool:
 
 
 def is_thrust_too_low_to_fly(b: Belief) -> bool:
-    """True if the reported thrust is too small to support the vehicle; False if it is unreliable or
-    hover thrust is unknown.
+    """True if the reported thrust is too small to support the vehicle in the air.
 
     The limit is `complete.hold_ratio` times hover thrust. Position mode never commands less than
     `MIN_FIRMWARE_POSITION_MODE_THRUST`, so that value is the limit if it is larger and still too
@@ -400,8 +400,9 @@ def _is_magnet_holding_vehicle(b: Belief) -> bool:
 
 def _is_hanging_with_motors_stopped(b: Belief) -> bool:
     """True if the vehicle is hanging, with its motors stopped, where it made contact: the weight
-    transfer has begun, the reported thrust is at most `MAX_RAW_THRUST_WITH_MOTORS_STOPPED` (or is
-    unreliable), and the vehicle neither moves vertically nor slips."""
+    transfer (reduction of raw thrust until the support carries the whole weight) has begun, the
+    reported thrust is at most `MAX_RAW_THRUST_WITH_MOTORS_STOPPED` (or is unreliable), and the
+    vehicle neither moves vertically nor slips."""
     return (
         b.command_history.weight_transfer_began_at_s is not None
         and (
@@ -418,7 +419,8 @@ def _is_hanging(b: Belief) -> bool:
     small to support it. During a descent to the floor, it must also be at the height of the last
     contact, at the target's height, or still where the descent began, because a drifted height may
     hide the floor. Without a valid position, a magnet cannot be distinguished from the floor, and
-    the result is True in both cases; the slow weight transfer is safe in both."""
+    the result is True in both cases; the slow reduction of the thrust that follows is safe in
+    both."""
     tel, complete = b.telemetry, b.profile.planner.complete
     if not b.is_position_valid:
         return is_thrust_too_low_to_fly(b) and is_vertically_motionless(b)
@@ -700,8 +702,9 @@ def is_evidence_fresh(b: Belief, condition: Condition[Belief]) -> bool:
 
 def has_slipped_off_contact(b: Belief) -> bool:
     """True if the vehicle has slipped off its contact: `is_slipping_off_contact` has been true for
-    `complete.slip_dwell_s`. Once the weight transfer by raw thrust has begun, one tick is enough in
-    which fresh telemetry shows a specific force below `complete.slip_acc_g` and a climb rate below
+    `complete.slip_dwell_s`. Once the weight transfer has begun, which reduces raw thrust until the
+    support carries the whole weight, one tick is enough in which fresh telemetry shows a specific
+    force below `complete.slip_acc_g` and a climb rate below
     `MAX_CLIMB_RATE_IF_FALLING_IN_WEIGHT_TRANSFER_MPS`."""
     tel, complete = b.telemetry, b.profile.planner.complete
     falls = (

@@ -26,13 +26,16 @@ class RequiredData(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Condition(Generic[ConditionInput]):
-    """A condition on the belief or the context, evaluated once per tick: for example `ON_FLOOR`.
+    """A condition that counts as evidence once it has been true for some time: for example
+    `ON_FLOOR`. It is evaluated once per tick, either on the estimated state of vehicle and target
+    (`Belief`) or on that together with the planner's own state (`Context`).
 
     Attributes:
         name: readable name, for `repr`.
         predicate: function that returns True if the condition is true in this tick.
         persists_across_phases: True if the condition describes the vehicle independently of its
-            maneuver: a change of phase or a hold does not reset its start time.
+            maneuver: its start time is not reset by a change of phase, or by a hold, which pauses
+            the mission.
         required_data: data that must be fresh for the condition to count. A condition that may stop
             the motors or end a flight requires at least fresh telemetry.
     """

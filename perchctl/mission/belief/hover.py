@@ -82,7 +82,7 @@ def estimate_hover_thrust(b: Belief) -> HoverThrust:
 def filter_rotor_thrust(b: Belief, dt_s: float) -> float:
     """Return the thrust, 0..65535, that the rotors produce `dt_s` after the previous sample: the
     reported thrust through a first-order lag with the time constant
-    `ROTOR_THRUST_TIME_CONSTANT_S`."""
+    `ROTOR_THRUST_TIME_CONSTANT_S`. At first, it is the reported thrust itself."""
     before, read = b.rotor_thrust, b.telemetry.thrust
     if before is None:
         return read
@@ -112,8 +112,8 @@ def learn_hover_thrust_in_quiet_flight(b: Belief, dt_s: float) -> HoverThrust:
 def learn_hover_thrust_in_descent(b: Belief, dt_s: float) -> HoverThrust:
     """Return the hover thrust (0..65535) after a tick of a descent by raw thrust: a Kalman update
     with the thrust that the rotors produce, which lags the reported thrust, divided by the specific
-    force along the body's z axis in g. `dt_s` is defined as in
-    `learn_hover_thrust_in_quiet_flight`. The result is clamped to within
+    force along the body's z axis in g. `dt_s` is the time since the previous telemetry sample, 0
+    if this tick has no new sample. The result is clamped to within
     `MAX_HOVER_THRUST_CORRECTION_IN_DESCENT_SIGMAS` standard deviations of the estimate from before
     the descent.
 

@@ -234,7 +234,7 @@ class FreezeDetector:
 
 @dataclass(frozen=True)
 class FallDetector:
-    """Time at which the vehicle last fell, or came down and reached the floor.
+    """Detector of falls, which records the last time at which the vehicle was falling.
 
     Let a be the vertical acceleration (positive up, limited to at least
     `MAX_UP_ACCELERATION_OF_CEILING_IMPACT_G`) minus its slowly learned offset. The climb rate v
@@ -428,9 +428,10 @@ class SteadySpeedDetector:
         """Return the detector at `t_s`, `dt_s` after its previous sample. `velocity_world_mps` is
         the newest velocity in world axes, integrated from the accelerometer.
 
-        Each speed counts as constant from a start time, which is reset to `t_s` if the vertical
-        speed has changed by more than `MAX_STEADY_CLIMB_RATE_DEVIATION_MPS` since then, or if the
-        lateral velocity differs from its mean by more than
+        Vertical speed and lateral velocity each have their own start time, from which they count as
+        constant. That of the vertical speed is reset to `t_s` if the speed has changed by more than
+        `MAX_STEADY_CLIMB_RATE_DEVIATION_MPS` since then. That of the lateral velocity is reset if
+        this velocity differs from its mean by more than
         `MAX_STEADY_LATERAL_VELOCITY_DEVIATION_MPS`.
         """
         x, y, z = velocity_world_mps

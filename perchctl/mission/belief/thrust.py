@@ -81,10 +81,10 @@ class HoverThrust:
         )
 
     def with_measurement(self, mean_thrust: float, averaging_time_s: float) -> HoverThrust:
-        """Return the estimate after a Kalman update with `mean_thrust`, the hover thrust measured
-        as a mean over `averaging_time_s`, 0..65535. A longer time gives the measurement more
-        weight; if it is 0, nothing changes. An estimate whose `sigma_fraction` is inf is replaced
-        by the measurement."""
+        """Return the estimate after a Kalman update with `mean_thrust`, 0..65535, the hover thrust
+        measured as a mean over `averaging_time_s`. A longer time gives the measurement more weight;
+        if it is 0, nothing changes. An estimate whose `sigma_fraction` is inf is replaced by the
+        measurement."""
         if averaging_time_s <= 0.0:
             return self
         if math.isinf(self.sigma_fraction):

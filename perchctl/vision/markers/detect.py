@@ -114,9 +114,9 @@ class DetectionPrior:
             standard deviation, as measured in a recent frame; None if it must be measured in this
             frame.
         measure_marker_to_own_target_distance_m: function that returns a marker's horizontal
-            distance, m, from the expected position of this vehicle's own target. It selects one of
-            several targets if none is expected at a known position. None if only the image is used
-            to select a target.
+            distance, m, from the position of this vehicle's own target. If several targets are in
+            view and no corners are expected, the target with the smallest distance is selected.
+            None if only the image is used to select a target.
     """
 
     expected_corners_px: Mapping[MarkerName, Array]
@@ -145,9 +145,11 @@ class CornerMethod:
 
     Attributes:
         name: heading in ``docs/corners.md``.
-        requirements_text: what the method needs, in words.
+        requirements_text: what the target must look like in the image, and what must be known about
+            it beforehand, for the method to succeed. This text and the next two are only shown to
+            readers of ``docs/corners.md``; no code evaluates them.
         cost_text: typical time for an image of 640x480 on one core.
-        run_condition_text: when the method runs, in words (`should_run`).
+        run_condition_text: description of the cases in which `should_run` returns True.
         should_run: function that returns True if the method should be tried on the image, given the
             prior and the results so far.
         find: function that runs the method and returns the new results, which replace the previous
@@ -415,9 +417,10 @@ def detect_markers(
         frames_without_markers: number of successive frames before this one without a marker.
             The kinds of search alternate depending on this number. If None, all kinds of search
             are used.
-        measure_marker_to_own_target_distance_m: function that returns a marker's distance from this
-            vehicle's own target. If several targets are in view and none is expected at a known
-            position, it selects one. None to select a target from the image only.
+        measure_marker_to_own_target_distance_m: function that returns a marker's horizontal
+            distance, m, from this vehicle's own target. If several targets are in view and no
+            corners are expected, the target with the smallest distance is selected. None to select
+            a target from the image only.
     """
     prior = make_detection_prior(
         frame,
@@ -513,17 +516,22 @@ def _detect_with_prior(
 def _choose_search_mode(
     frames_without_markers: int | None, is_target_expected: bool, is_line_fit_enabled: bool
 ) -> SearchMode:
-    """Return the kind of search to use in this frame. The first of these cases that applies
-    determines the result:
+    """Return the kind of search to use in this frame. `frames_without_markers` is the number of
+    successive frames before this one in which no marker was found. The first of these cases that
+    applies determines the result:
 
-    - `frames_without_markers` is None: "all".
-    - Line fits are disabled: "whole_sharp".
-    - A target is expected, and the previous frame showed a marker (`frames_without_markers` is 0):
-      "near_expected".
-    - A target is expected, but no marker was found in the last `frames_without_markers` frames:
-      "whole_sharp" if this number is odd; otherwise "expected_fits" and "expected_window" in turn.
-    - No target is expected: "whole_blurred" after every `DetectorConfig.blurred_every` frames
-      without markers, otherwise "whole_sharp".
+    - `frames_without_markers` is None: "all", which combines all kinds of search.
+    - Line fits are disabled: "whole_sharp", which searches the whole image for a sharp target.
+    - A target is expected, and `frames_without_markers` is 0: "near_expected", which searches near
+      the expected position for a sharp or blurred target.
+    - A target is expected, and `frames_without_markers` is odd: "whole_sharp".
+    - A target is expected, and `frames_without_markers` is even: alternately "expected_fits", which
+      searches near the expected position for a blurred target only, and "expected_window", which
+      searches there for a sharp target only.
+    - No target is expected, and `frames_without_markers` is a multiple of
+      `DetectorConfig.blurred_every`, but not 0: "whole_blurred", which searches the whole image for
+      a blurred target.
+    - Otherwise: "whole_sharp".
     """
     if frames_without_markers is None:
         return "all"
@@ -557,14 +565,17 @@ def _is_marker_missing(
 
 
 def _refine_found_markers(detector_input: DetectorInput, found: FoundMarkers) -> _FoundCorners:
-    """Refine the raw corners from a search, and return the markers that could be measured. Each
-    marker is measured with the edge fit or, if this fails, with subpixel refinement. If line fits
-    are disabled, only subpixel refinement is used, and nothing else follows.
+    """Refine the raw corners of the markers that a search found, and return the markers that could
+    be measured. If line fits are disabled, subpixel refinement is the only method. Otherwise, these
+    methods are used in turn:
 
-    A marker that is truncated or hidden, or that the edge fit could not measure, is measured with
-    the partial-view fit if possible, because a search may mistake the image border for a side. If
-    this fails too, a truncated or hidden marker is omitted. The photometric fit follows if the
-    edges are not accurate enough.
+    1. The edge fit measures each marker.
+    2. If the edge fit fails, or if the marker is truncated or hidden, the partial-view fit measures
+       the marker, because a search may mistake the image border for a side. If this fails too, a
+       truncated or hidden marker is omitted. Any other marker keeps the corners of the edge fit or,
+       if that failed, of subpixel refinement.
+    3. The photometric fit measures each marker whose edges are not accurate enough. If there is
+       only one marker and its fit fails, it is dropped.
     """
     image, setup = detector_input.image, detector_input.setup
     raw = {name: found.corners_px[name] for name in MARKERS if name in found.corners_px}
@@ -655,8 +666,8 @@ def extrapolate_corners(previous: Detections | None, t_s: float) -> dict[MarkerN
 def add_marker_flow(current: Detections, previous: Detections | None) -> Detections:
     """Return `current` with the image velocity, px/s, of its markers' corners since the `previous`
     detections, by finite differences. If only one marker was detected both times, the other one
-    gets the mean velocity of its corners. No velocity is added if no marker was detected both times
-    or if `previous` is more than `_MAX_MARKER_FLOW_AGE_S` old."""
+    gets the mean velocity of that marker's corners. `current` is returned unchanged if no marker
+    was detected both times, or if `previous` is None or more than `_MAX_MARKER_FLOW_AGE_S` old."""
     if previous is None or not 0.0 < current.t_s - previous.t_s <= _MAX_MARKER_FLOW_AGE_S:
         return current
     flow: dict[MarkerName, Array] = {}
@@ -701,12 +712,12 @@ def refine_photometrically(
     detector_input: DetectorInput, found_corners: _FoundCorners, is_from_search: bool = False
 ) -> _FoundCorners:
     """Return `found_corners` with more accurate corners: the marker's drawing is fitted to the
-    image for each marker whose edge fit is not accurate enough. If the fit fails, the marker keeps
-    its corners. If only one marker was found, the other one is located from it, and added if the
-    image shows it.
+    image for each marker whose edge fit is not accurate enough. If only one marker was found, the
+    other one is located from it, and added if the image shows it.
 
-    If `is_from_search` is True, the markers were decoded by a search, and their positions were not
-    predicted. A single marker is then dropped if its drawing was fitted but does not match.
+    If the fit of a drawing fails, the marker keeps its corners, with one exception: if
+    `is_from_search` is True and it is the only marker, it is dropped. `is_from_search` means that
+    the markers were decoded by a search, so no predicted position confirms them.
     """
     image, patterns, better = (
         detector_input.image,

@@ -165,10 +165,11 @@ def is_fully_visible(detector_input: DetectorInput, corners: RefinedCorners) -> 
 def _make_edge_normal_equations(
     visible_edges: VisibleEdges, edge_shift_prior: EdgeShift
 ) -> tuple[Array, Array, Array]:
-    """Set up one Gauss-Newton step that moves the square to the visible edges, which are measured
-    with n profiles each. The nine unknowns x are the increment of the homography (8) and the
-    distance by which white has grown over black at all edges, px. `edge_shift_prior` is the
-    expected value of this distance and its standard deviation.
+    """Set up one Gauss-Newton step that moves the square to the visible edges, each of which is
+    measured on n profiles (short lines across it, along which the image is sampled). The nine
+    unknowns x are the increment of the homography (8) and the distance by which white has grown
+    over black at all edges, px. `edge_shift_prior` is the expected value of this distance and its
+    standard deviation.
 
     Returns three arrays: the derivatives (9, edges * n) of the edges' outward offsets, px, with
     respect to x, and the normal matrix N (9, 9) and the right-hand side g (9,) of the normal
@@ -227,7 +228,7 @@ def _make_refined_corners(
             from its centre, to pixels of that pinhole camera.
         visible_edges: the measured edges.
         residual_px: distances (edges, n) of the n measured points of each edge from the fitted
-            square.
+            square, positive away from the square's centre.
         normal_matrix: normal matrix (9, 9) of the last step (`_make_edge_normal_equations`).
         pattern: the marker's pattern.
         camera: camera model, including lens distortion.

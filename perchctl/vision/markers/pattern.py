@@ -88,9 +88,10 @@ class MarkerPattern:
 def make_cells_along_border(
     bits: NDArray[np.uint8], print_edge_sigma_cells: float = 0.0
 ) -> CellsAlongBorder:
-    """Return the cells inside the border of a marker with inner bits (n, n), 1 = white: the cells
-    whose blur may reach the edges of the border. `print_edge_sigma_cells` is the standard deviation
-    of a printed edge's position, in cells."""
+    """Return the colours of the two outermost layers of cells inside the black border of a marker
+    with inner bits (n, n), 1 = white. The edge fits use them, because the blur of these cells may
+    reach the edges of the border. `print_edge_sigma_cells` is the standard deviation of a printed
+    edge's position, in cells."""
     n = len(bits)
 
     def ring(depth: int) -> Array:
@@ -182,9 +183,10 @@ def has_mostly_matching_cells(
 def is_correlated_with_pattern(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> bool:
-    """True if the grey values in the cells of a marker with corners (4, 2) px in the image, without
-    rotation of the marker, have a correlation of more than `_MIN_PATTERN_CORRELATION` with the
-    pattern. False if the marker is partly outside the image."""
+    """True if the grey values in the cells of a marker with corners (4, 2) px in the image have a
+    correlation of more than `_MIN_PATTERN_CORRELATION` with the pattern. The first corner is taken
+    as the marker's top left as printed; other rotations are not tried. False if there is no
+    contrast or the marker is partly outside the image."""
     return (
         float(correlate_pattern_rotations(image, corners_px, pattern)[0]) > _MIN_PATTERN_CORRELATION
     )
@@ -326,11 +328,11 @@ def _cell_coverage(
     max_counted_distance_from_centre_half_sides: float = math.inf,
 ) -> Array:
     """Return the fraction of each node's interval that each cell covers, (nodes, cells), along one
-    axis. A node's interval extends `node_half_width_half_sides` to each side of its position. The
-    `cells_per_side` cells fill the interval from -square_half_width_half_sides to
-    square_half_width_half_sides; of each cell, only the part up to
-    `max_counted_distance_from_centre_half_sides` from the centre counts. Lengths are in half sides
-    from the marker's centre."""
+    axis of a grid of nodes over the marker, at which the drawing is rendered. A node's interval
+    extends `node_half_width_half_sides` to each side of its position. The `cells_per_side` cells
+    fill the interval from -square_half_width_half_sides to square_half_width_half_sides; of each
+    cell, only the part up to `max_counted_distance_from_centre_half_sides` from the centre counts.
+    Lengths are in half sides from the marker's centre."""
     edges = square_half_width_half_sides * np.linspace(-1.0, 1.0, cells_per_side + 1)
     edges = np.clip(
         edges,
@@ -346,7 +348,8 @@ def _cell_coverage(
 
 
 def _add_margin_nodes(node_positions_half_sides: Array, node_half_width_half_sides: float) -> Array:
-    """Return the node positions along one axis after adding `BLUR_MARGIN_NODES` nodes at both ends.
+    """Return the positions of a grid's nodes along one axis, in half sides from the marker's
+    centre, after adding `BLUR_MARGIN_NODES` nodes at both ends to make room for the blur.
     `node_half_width_half_sides` is half the spacing of the nodes."""
     more = 2.0 * node_half_width_half_sides * np.arange(1, BLUR_MARGIN_NODES + 1)
     return np.concatenate(
@@ -362,13 +365,13 @@ def _add_margin_nodes(node_positions_half_sides: Array, node_half_width_half_sid
 def render_whiteness_and_off_paper_fraction(
     drawing: MarkerDrawing, nodes_per_side: int
 ) -> tuple[NDArray[np.float32], ...]:
-    """Render the drawing at n by n nodes (`nodes_per_side`) over the square that the photometric
-    fit compares with the image, and at a margin of `BLUR_MARGIN_NODES` nodes around them, without
-    blur.
+    """Render the drawing without blur on a grid of n by n nodes (`nodes_per_side`) over the square
+    that the photometric fit compares with the image. A margin of m = `BLUR_MARGIN_NODES` nodes is
+    added on all sides, so that the result can be blurred afterwards.
 
-    The first array returned is the whiteness of each node, 0 to 1. If the drawing has a
-    `paper_half_width_half_sides`, a second array contains the fraction of each node that is beyond
-    the paper.
+    The first array returned, (n + 2m, n + 2m), is the whiteness of each node, 0 to 1: the mean over
+    the small square around it. If the drawing has a `paper_half_width_half_sides`, a second array
+    of the same shape contains the fraction of this small square that is beyond the paper.
     """
     node_half_width_half_sides = drawing.photometric_fit_half_width_half_sides / nodes_per_side
     node_positions_half_sides: Array = node_half_width_half_sides * (
@@ -388,11 +391,13 @@ def render_whiteness_and_off_paper_fraction(
 
 @lru_cache(maxsize=64)
 def render_black_square(cells_per_side: int, nodes_per_side: int) -> NDArray[np.float32]:
-    """Return the whiteness, 0 to 1, of a plain black square on white paper in place of a marker, at
-    n by n nodes (`nodes_per_side`) and at a margin of `BLUR_MARGIN_NODES` nodes around them. The
-    square has the side of the marker. `cells_per_side`, the marker's number of cells including the
-    border, determines how far the nodes extend beyond it, as in
-    `render_whiteness_and_off_paper_fraction`."""
+    """Return the whiteness, 0 to 1, of a plain black square on white paper that has the size of a
+    marker but no inner pattern, without blur. The photometric fit subtracts it to compare the inner
+    pattern alone.
+
+    The result (n + 2m, n + 2m) covers a grid of n by n nodes (`nodes_per_side`) and a margin of m =
+    `BLUR_MARGIN_NODES` nodes around them. `cells_per_side`, the marker's number of cells including
+    the border, determines how far the nodes extend beyond the square."""
     return render_whiteness_and_off_paper_fraction(
         MarkerDrawing(np.zeros((cells_per_side, cells_per_side))), nodes_per_side
     )[0]
@@ -436,10 +441,12 @@ def blurred_cell_coverage(
     node_half_width_half_sides: float,
     blur_sigma_nodes: float,
 ) -> Array:
-    """Return the fraction (n, cells) of each node's interval that each row of the drawing's cells
-    covers, along one axis, after a Gaussian blur with the standard deviation `blur_sigma_nodes`, in
-    node spacings. The nodes are at `node_positions_half_sides` (n,), in half sides from the
-    marker's centre; their intervals extend `node_half_width_half_sides` to each side."""
+    """Return the fraction (n, cells) of each node's interval that each row (or column) of the
+    drawing's cells covers, along one axis of a grid of nodes, after a Gaussian blur with the
+    standard deviation `blur_sigma_nodes`, in node spacings. The product of two such fractions, one
+    for each axis, is the weight of a cell's colour in the grey value of a node. The nodes are at
+    `node_positions_half_sides` (n,), in half sides from the marker's centre; their intervals extend
+    `node_half_width_half_sides` to each side."""
     wide = _cell_coverage(
         _add_margin_nodes(node_positions_half_sides, node_half_width_half_sides),
         node_half_width_half_sides,

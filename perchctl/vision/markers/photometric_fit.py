@@ -100,7 +100,8 @@ class DrawingAlignment:
 
     Attributes:
         corners_px: the marker's corners (4, 2) in the distorted image.
-        corner_sigma_px: standard deviation of the corners.
+        corner_sigma_px: standard deviation of a corner's x or y, the root mean square over the four
+            corners.
         fit_correlation: correlation, 0 to 1, of the image's grey values with those of the whole
             fitted drawing.
         inner_pattern_correlation: correlation, -1 to 1, of the image with the inner pattern alone:
@@ -115,7 +116,8 @@ class DrawingAlignment:
         largest_opposite_colour_likeness_sigma: standard deviation of this measure for the cell in
             which it is least certain.
         blur_sigma_px: standard deviation of the fitted blur.
-        largest_motion_from_start_px: largest distance of a fitted corner from its start.
+        largest_motion_from_start_px: largest change, in x or y, of a fitted corner from the
+            position at which the fit started.
     """
 
     corners_px: Array
@@ -132,7 +134,9 @@ class DrawingAlignment:
 
 @dataclass(frozen=True, eq=False)
 class _NormalEquations:
-    """The normal equations of one Gauss-Newton iteration.
+    """The normal equations of one Gauss-Newton iteration for a drawing at n by n nodes. The k
+    unknowns are the increment of the homography (8), the variance of the blur (1), and the
+    coefficients of the illumination (7 or 8).
 
     Attributes:
         contrast_grey: difference between white and black, in grey levels.
@@ -141,8 +145,8 @@ class _NormalEquations:
         grey_jacobian: derivatives (k, n * n) of the drawing's grey values with respect to the
             unknowns.
         noise_variance_grey2: variance of a residual.
-        normal_matrix, right_hand_side: N and g of the normal equations N x = g for the next
-            increment x, both divided by that variance.
+        normal_matrix, right_hand_side: N (k, k) and g (k,) of the normal equations N x = g for the
+            next increment x of the unknowns, both divided by that variance.
     """
 
     contrast_grey: float
@@ -568,7 +572,8 @@ def _sample_patch(
 ) -> Array:
     """Return the grey values (n * n,) of the patch at the nodes projected by `H_pinhole_marker` and
     shifted by `distortion_shift_minus_patch_corner_px` (2, n * n): the lens distortion at each node
-    minus the position of the patch's top-left pixel."""
+    minus the position of the patch's top-left pixel. The patch is the part of the image around the
+    marker that the fit uses."""
     at = (
         project_nodes(H_pinhole_marker, grid.node_uv1) + distortion_shift_minus_patch_corner_px
     ).astype(np.float32)
@@ -615,11 +620,13 @@ _LOG_BLUR_TABLE_STEP = 0.02  # Relative step between the blurs in the table.
 
 @dataclass(frozen=True, eq=False)
 class RenderedDrawing:
-    """A marker's `drawing` at the nodes of `grid`, which lies in the marker's plane. The properties
-    are its whiteness (0 black, 1 white) and the fraction of each node that is beyond the paper,
-    blurred by a Gaussian with the standard deviation `blur_sigma_nodes`, in node spacings, and the
-    basis functions from which any illumination makes grey values. They are computed when they are
-    first used."""
+    """A marker's `drawing` rendered at the nodes of `grid`, which lies in the marker's plane, after
+    a Gaussian blur with the standard deviation `blur_sigma_nodes`, in node spacings.
+
+    The properties are computed when they are first used: the blurred whiteness of each node with
+    its derivatives, the basis from which grey values under any illumination are combined, the same
+    basis for a plain black square, and how much each row of cells covers each node.
+    """
 
     drawing: MarkerDrawing
     grid: SamplingGrid
@@ -627,10 +634,10 @@ class RenderedDrawing:
 
     @cached_property
     def blurred_whiteness_and_off_paper_fraction(self) -> tuple[tuple[Array, Array], ...]:
-        """The arrays of `render_whiteness_and_off_paper_fraction` after the blur. Each array is
-        returned as a pair: its values (n * n,) at the nodes, and their derivatives (9, n * n) with
-        respect to the increment of the homography (8) and the variance of the blur, in squared node
-        spacings."""
+        """The blurred drawing: the whiteness of each node (0 black, 1 white) and, if the size of
+        the paper is known, the fraction of each node that is beyond the paper. Each of the two is a
+        pair: the values (n * n,) at the nodes, and their derivatives (9, n * n) with respect to the
+        increment of the homography (8) and the variance of the blur, in squared node spacings."""
         sharp_node_values = render_whiteness_and_off_paper_fraction(
             self.drawing, self.grid.nodes_per_side
         )
@@ -641,10 +648,11 @@ class RenderedDrawing:
 
     @cached_property
     def illumination_basis(self) -> tuple[Array, Array]:
-        """Basis of the drawing's grey values under any illumination, and the Gram matrix of its
-        rows. The rows (7 or 8, n * n) are the black level and its slopes in x and y, the contrast
-        (gain) and its slopes, and the bend of the tone curve. The eighth row, the grey beyond the
-        paper, only exists if the size of the paper is known
+        """Basis of the drawing's grey values, and the Gram matrix of its rows. Under any
+        illumination, the grey values at the nodes are a weighted sum of the rows (7 or 8, n * n).
+        The weights are the black level and its slopes in x and y, the contrast (gain) and its
+        slopes, and the bend of the tone curve. The eighth row, whose weight is the change of grey
+        beyond the paper, only exists if the size of the paper is known
         (`MarkerDrawing.paper_half_width_half_sides`)."""
         u, v, one = self.grid.node_uv1
         (white, _), *others = self.blurred_whiteness_and_off_paper_fraction
@@ -654,9 +662,10 @@ class RenderedDrawing:
 
     @cached_property
     def black_square_illumination_basis(self) -> tuple[Array, Array]:
-        """Illumination basis for a plain black square in place of the marker, without the slopes of
-        the gain and without the bend of the tone curve: the rows (4 or 5, n * n), and their Gram
-        matrix."""
+        """Basis of the grey values of a plain black square in place of the marker, to separate the
+        inner pattern from the border: the rows (4 or 5, n * n), and their Gram matrix. The rows
+        correspond to those of `illumination_basis`, without the slopes of the gain and the bend of
+        the tone curve."""
         soft = blur_node_values(
             render_black_square(len(self.drawing.cell_whiteness), self.grid.nodes_per_side),
             self.blur_sigma_nodes,
