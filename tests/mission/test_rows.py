@@ -24,7 +24,7 @@ from perchctl.mission import (
 )
 from perchctl.mission.belief.mounting import MIN_CONTRADICTING_SIGHTINGS, CameraMountingMonitor
 from perchctl.mission.phase import PRE_LANDING_PHASES, Severity
-from perchctl.mission.phases.align import ALIGNED
+from perchctl.mission.phases.align import ALIGNED, MAX_WAIT_FOR_CLIMB_PERMISSION_S
 from perchctl.mission.table import (
     TABLE,
     TRANSITIONS_ALLOWED_FOR_USER_ROWS,
@@ -142,6 +142,7 @@ LAND_ON_LOG = changed({"safety.land_on_log_error": True})
 QUIET = HOVER_THRUST * 0.5
 PRESSED = HOVER_THRUST * 1.12
 FULL = 65535.0
+LONGEST_WAIT_S = MAX_WAIT_FOR_CLIMB_PERMISSION_S + 0.2
 OFF = {"thrust": 0.0, "supervisor": READY}
 
 # row of the table: its case
@@ -262,10 +263,10 @@ CASES: dict[str, Case] = {
         profile=changed({"safety.max_height_m": 1.04}, HOVERING),
     ),
     "climb-not-permitted": Case(
-        P.ALIGN, P.LANDING, seen(climb_withheld_reason="not now"), 20.2, O.SAFETY
+        P.ALIGN, P.LANDING, seen(climb_withheld_reason="not now"), LONGEST_WAIT_S, O.SAFETY
     ),
     "climb-withheld": Case(
-        P.ALIGN, P.LANDING, seen(climb_withheld_reason="not now"), 20.2, O.SAFETY
+        P.ALIGN, P.LANDING, seen(climb_withheld_reason="not now"), LONGEST_WAIT_S, O.SAFETY
     ),
     "aligned": Case(P.ALIGN, P.ASCEND, seen(), 0.6),
     "ascend-lost": Case(P.ASCEND, P.RECOVER, unseen(), 0.6),
