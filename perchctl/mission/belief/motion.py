@@ -249,7 +249,7 @@ class FallDetector:
     rebound lasts. A slow descent goes undetected because it is learned as an offset.
     """
 
-    last_fall_at_s: float = -math.inf  # last fall, or descent to the floor
+    last_fall_at_s: float = -math.inf  # last fall
     # time from which the accelerometer has read less than
     # `MAX_ACCELEROMETER_READING_IN_FREE_FALL_G`
     low_g_began_at_s: float = math.inf
