@@ -34,7 +34,7 @@ from common import table
 from perchctl.geometry import Array
 from perchctl.mission import PlannerState, UnfilteredPose, step_mission
 from perchctl.mission.belief.belief import Belief
-from perchctl.mission.belief.reckoning import DeadReckoning, advance_dead_reckoning
+from perchctl.mission.belief.reckoning import DeadReckoningState, advance_dead_reckoning
 from perchctl.record import FlightLog, read_log
 
 HORIZONS_S = (0.5, 1.0, 2.0, 3.0)
@@ -232,7 +232,7 @@ def _blind(
     b: Belief, axes: tuple[Axis, ...], later: list[Moment], truth: Truth
 ) -> Iterator[tuple[float, list[tuple[float, float]]]]:
     begin_s, imu = b.obs.t_s, b.imu
-    old: DeadReckoning = b.dead_reckoning
+    old: DeadReckoningState = b.dead_reckoning
     new = [axis.copy(i) for i, axis in enumerate(axes)]
     for axis in new:
         axis.x[0] = 0.0

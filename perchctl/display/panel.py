@@ -64,7 +64,7 @@ def _error_row(tick: Tick) -> list[tuple[str, str]]:
 def _hover_text(state: PlannerState) -> str:
     errors, hover = state.hover_errors, state.belief.profile.planner.hover
     of = "" if hover is None else f" of {hover.duration_s:g}"
-    *axes, yaw_rad = errors.rms_xyz_yaw
+    *axes, yaw_rad = errors.rms_level_xyz_m_yaw_rad
     if not errors.frame_count:
         return f"{errors.duration_s:.0f}{of} s"
     x, y, z = (f"{1e3 * each:.1f}" for each in axes)

@@ -34,9 +34,9 @@ from perchctl.mission.belief.contact import (
 )
 from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.belief.reckoning import MAGNET_REACH_BELOW_TARGET_M
-from perchctl.mission.belief.thrust import MIN_FIRMWARE_POSITION_MODE_THRUST
+from perchctl.mission.belief.thrust import MIN_RAW_THRUST_IN_FIRMWARE_POSITION_MODE
 from perchctl.mission.belief.update import (
-    KEEPALIVE_RAW_THRUST,
+    COMMANDED_KEEPALIVE_RAW_THRUST,
     reset_phase_dependent_conditions,
     start_dead_reckoning,
     update_thrust_check_after_command,
@@ -44,7 +44,7 @@ from perchctl.mission.belief.update import (
 from perchctl.mission.context import Context
 from perchctl.mission.level_descent import (
     MIN_COMMANDED_TO_HOVER_THRUST_RATIO,
-    MIN_DISTANCE_BELOW_CONTACT_WHEN_DETACHED_M,
+    MIN_DISTANCE_BELOW_CONTACT_TO_COUNT_AS_DETACHED_M,
     descend_level_by_raw_thrust,
     should_begin_descent_with_setpoints,
 )
@@ -53,7 +53,7 @@ from perchctl.mission.observe import update_state_with_observation
 from perchctl.mission.phase import Phase, Severity, VehicleDiagnosis
 from perchctl.mission.release import (
     catch_falling_vehicle,
-    choose_catch_setpoint_height_above_vehicle_m,
+    choose_fall_catch_setpoint_above_vehicle_m,
     end_press,
     forget_contact_when_below,
     stop_motors,
@@ -82,15 +82,15 @@ PEEL_OFF_MAGNET_TIMEOUT_S = 4.0
 """Time after which a vehicle that has not come off the magnet stops pulling and transfers its
 weight to the magnet, s. Larger: the vehicle pulls for longer, and falls if the magnet lets go
 late."""
-MAX_CLIMB_RATE_WHEN_FALLING_OFF_MAGNET_MPS = -0.35
+MAX_CLIMB_RATE_TO_COUNT_AS_FALLING_OFF_MAGNET_MPS = -0.35
 """Climb rate below which a vehicle that is peeling off the magnet is falling, m/s."""
 MAX_HEIGHT_TO_COUNT_AS_LANDED_M = 0.05
 """Height below which a motionless vehicle in a descent by raw thrust counts as being on the floor,
 m."""
-MAX_VERTICAL_SPEED_OF_MOTIONLESS_VEHICLE_MPS = 0.1
+MAX_VERTICAL_SPEED_TO_COUNT_AS_MOTIONLESS_MPS = 0.1
 """Largest vertical speed of a motionless vehicle, m/s. Larger: the motors stop while the vehicle is
 still climbing or sinking."""
-ON_FLOOR_DWELL_S = 0.5
+MOTIONLESS_DWELL_BEFORE_MOTOR_STOP_S = 0.5
 """Time for which a vehicle must be motionless before its motors are stopped, s."""
 
 # --- level, by raw thrust ---
@@ -103,7 +103,7 @@ jumps again and again, position control moves the vehicle in a wrong direction."
 LANDING_COMMAND_PERIOD_S = 0.3
 """Time between landing commands, s. Without its notify message, the firmware does not execute a
 command (docs/firmware.md, "Order without notify")."""
-MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION = 3
+MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION_BY_TELEMETRY = 3
 """Number of landing commands before the telemetry can confirm that the vehicle is landing."""
 MAX_LANDING_COMMAND_COUNT = 6
 """Largest number of landing commands."""
@@ -113,7 +113,7 @@ ONBOARD_LANDING_DURATION_MARGIN_S = 1.8
 """Time added to the duration of the quintic landing trajectory, s."""
 QUINTIC_PEAK_TO_MEAN_SPEED_RATIO = 1.875
 """Ratio of a quintic's peak speed to its mean speed."""
-ONBOARD_LANDING_EXTENSION_LEAD_S = 1.0
+TIME_BEFORE_END_TO_EXTEND_ONBOARD_LANDING_S = 1.0
 """Time before the end of its trajectory at which the firmware's landing is extended, s; the vehicle
 has sunk by 95 % of the trajectory by then. Larger: the vehicle sinks more slowly, because each
 trajectory starts from rest. Smaller: if commands are lost, the trajectory ends first."""
@@ -121,7 +121,7 @@ MAX_ONBOARD_LANDING_EXTENSIONS = 4
 """Number of extensions, each of which lowers the vehicle by 0.3 to 0.5 m. Larger: if the estimate
 sinks faster than the vehicle can, the vehicle climbs for longer. Smaller: after a longer drift, the
 last trajectory ends in the air."""
-MIN_DEPTH_BELOW_GROUND_TO_EXTEND_LANDING_M = 0.1
+MIN_ESTIMATED_DEPTH_BELOW_GROUND_TO_EXTEND_LANDING_M = 0.1
 """Estimated depth below the ground beyond which a vehicle that is still flying shows that the
 ground is lower, m. Larger: a trajectory ends before it is extended. Smaller: the error of a height
 without drift extends the landing."""
@@ -130,22 +130,22 @@ MIN_HEIGHT_ABOVE_GROUND_TO_EXTEND_LANDING_M = 0.06
 just before its end, m: with too little thrust, it may float in its own ground effect, and stopped
 motors would let it drop. Larger: the vehicle drops from there. Smaller: a vehicle that touches down
 at the last moment waits for another trajectory."""
-ONBOARD_LANDING_EXTENSION_LEAD_IF_ABOVE_GROUND_S = 0.25
+TIME_BEFORE_END_TO_EXTEND_LANDING_ABOVE_GROUND_S = 0.25
 """Time before the end of its trajectory at which the firmware's landing is extended if the vehicle
 is still flying above the estimated ground, s. Larger: a landing that is about to touch down is
 extended. Smaller: if a command is lost, the trajectory ends first."""
-MIN_THRUST_TO_HOVER_RATIO_IF_FLYING = 0.85
+MIN_THRUST_TO_HOVER_RATIO_TO_COUNT_AS_FLYING = 0.85
 """Thrust, as a fraction of the hover thrust, from which a vehicle that the firmware is landing
 counts as still flying. Once the vehicle is on the floor, and therefore above the end of its
 trajectory, the firmware commands its smallest thrust. Larger: a vehicle that sinks faster and
 faster counts as landed. Smaller: a vehicle that has just touched down counts as flying."""
 MAX_ASSUMED_HEIGHT_DRIFT_FOR_LANDING_GOAL_M = 1.0
 """Largest assumed drift of the height, m."""
-MAX_SPECIFIC_FORCE_IN_FALL_G = 0.5
+MAX_SPECIFIC_FORCE_TO_COUNT_AS_FALLING_G = 0.5
 """Specific force below which the vehicle is falling, g: no floor is supporting it."""
-MAX_SINK_RATE_OF_DROP_ONTO_FLOOR_MPS = 1.0
+MAX_SINK_RATE_TO_COUNT_AS_LANDED_MPS = 1.0
 """Largest speed of a drop from 5 cm above the floor, m/s."""
-MIN_MIDAIR_MOTOR_CUT_HEIGHT_M = 0.4
+MIN_HEIGHT_TO_COUNT_MOTOR_STOP_AS_IN_FLIGHT_M = 0.4
 """Height above which stopped motors mean that they were cut in flight and not that the vehicle has
 landed, m."""
 
@@ -186,11 +186,16 @@ def begin_landing(state: PlannerState) -> PlannerState:
     new = replace(
         state,
         phase=Phase.LANDING,
-        entry=replace(state.entry, t_s=b.obs.t_s, position_m=tel.position_m, yaw_rad=tel.yaw_rad),
+        entry=replace(
+            state.entry,
+            t_s=b.obs.t_s,
+            vehicle_world_position_m=tel.position_m,
+            vehicle_world_yaw_rad=tel.yaw_rad,
+        ),
         severity=max(state.severity, Severity.LAND),
         condition_start_times_s={},
         belief=reset_phase_dependent_conditions(b),
-        must_end_press=state.catch_setpoint_height_above_vehicle_m is None
+        must_end_press=state.fall_catch_setpoint_above_vehicle_m is None
         and is_pressing_against_surface(b),
         last_stop_or_land_command_at_s=None,
         stop_or_land_command_count=0,
@@ -218,7 +223,7 @@ def enter_descent(state: PlannerState, previous_state: PlannerState) -> PlannerS
     ):
         state = replace(
             state,
-            stop_or_land_command_count=MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION,
+            stop_or_land_command_count=MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION_BY_TELEMETRY,
             last_stop_or_land_command_at_s=b.obs.t_s,
         )
     elif heard and tel.thrust < 1 and previous_state.motor_stop_commanded_at_s is None:
@@ -259,11 +264,11 @@ def act_in_landing(c: Context) -> Action:
         return _restart_landing_by_catching_fall(c)
     if (
         state.motor_stop_commanded_at_s is None
-        and state.catch_setpoint_height_above_vehicle_m is not None
+        and state.fall_catch_setpoint_above_vehicle_m is not None
     ):
         if (caught := _catch_fall(c)) is not None:
             return caught
-        c = Context(replace(state, catch_setpoint_height_above_vehicle_m=None))
+        c = Context(replace(state, fall_catch_setpoint_above_vehicle_m=None))
     is_off = c.true_for_s(MOTORS_OFF_DESPITE_THRUST_COMMAND) >= MOTORS_OFF_DWELL_S
     if c.state.motor_stop_commanded_at_s is not None or is_off or _is_standing_on_floor(c):
         return stop_motors(c)
@@ -349,8 +354,8 @@ def _has_fallen_off_magnet(c: Context) -> bool:
     """True if the vehicle has come off the magnet and is falling. During a weight transfer and
     after the command to stop the motors, it must have slipped off its contact
     (`has_slipped_off_contact`). Before that, a contact must be recorded, no catch may be in
-    progress, and the climb rate must be below `MAX_CLIMB_RATE_WHEN_FALLING_OFF_MAGNET_MPS`; during
-    the firmware's own landing, no fall is detected. Always False with old IMU data."""
+    progress, and the climb rate must be below `MAX_CLIMB_RATE_TO_COUNT_AS_FALLING_OFF_MAGNET_MPS`;
+    during the firmware's own landing, no fall is detected. Always False with old IMU data."""
     b, state = c.belief, c.state
     if not b.is_imu_fresh:
         return False
@@ -358,23 +363,23 @@ def _has_fallen_off_magnet(c: Context) -> bool:
         return b.is_possibly_in_magnet_reach and has_slipped_off_contact(b)
     if state.stop_or_land_command_count:
         return False
-    caught = state.catch_setpoint_height_above_vehicle_m is None
+    caught = state.fall_catch_setpoint_above_vehicle_m is None
     return (
         b.vehicle_world_z_at_last_contact_m is not None
         and caught
-        and b.is_sinking(-MAX_CLIMB_RATE_WHEN_FALLING_OFF_MAGNET_MPS)
+        and b.is_sinking(-MAX_CLIMB_RATE_TO_COUNT_AS_FALLING_OFF_MAGNET_MPS)
     )
 
 
 def _is_standing_on_floor(c: Context) -> bool:
     """True if the vehicle is proven to be on the floor, in one of two ways. The condition
     `ON_FLOOR` (motionless, with too little thrust to fly, and low or further down than at the
-    start) has been true for `ON_FLOOR_DWELL_S`, and the telemetry is fresh. Or, in a descent by raw
-    thrust with valid positions from the target, the vehicle is lower than
+    start) has been true for `MOTIONLESS_DWELL_BEFORE_MOTOR_STOP_S`, and the telemetry is fresh. Or,
+    in a descent by raw thrust with valid positions from the target, the vehicle is lower than
     `MAX_HEIGHT_TO_COUNT_AS_LANDED_M`, its vertical speed is below
-    `MAX_VERTICAL_SPEED_OF_MOTIONLESS_VEHICLE_MPS`, and it cannot be on the magnet."""
+    `MAX_VERTICAL_SPEED_TO_COUNT_AS_MOTIONLESS_MPS`, and it cannot be on the magnet."""
     b = c.belief
-    if b.is_telemetry_fresh and c.true_for_s(ON_FLOOR) >= ON_FLOOR_DWELL_S:
+    if b.is_telemetry_fresh and c.true_for_s(ON_FLOOR) >= MOTIONLESS_DWELL_BEFORE_MOTOR_STOP_S:
         return True
     placed = (
         b.is_target_position_source and b.is_position_valid and b.dead_reckoning_began_at_s is None
@@ -384,7 +389,7 @@ def _is_standing_on_floor(c: Context) -> bool:
         placed
         and c.state.descent.last_commanded_raw_thrust > 0.0
         and low
-        and abs(b.climb_mps) < MAX_VERTICAL_SPEED_OF_MOTIONLESS_VEHICLE_MPS
+        and abs(b.climb_mps) < MAX_VERTICAL_SPEED_TO_COUNT_AS_MOTIONLESS_MPS
     )
 
 
@@ -406,14 +411,19 @@ def _restart_landing_by_catching_fall(c: Context) -> Action:
         weight_transfer_began_at_s=None,
         motor_stop_commanded_at_s=None,
         must_end_press=False,
-        catch_setpoint_height_above_vehicle_m=choose_catch_setpoint_height_above_vehicle_m(
+        fall_catch_setpoint_above_vehicle_m=choose_fall_catch_setpoint_above_vehicle_m(
             b.hover_thrust, tel.thrust
         ),
         setpoint=None,
         last_stop_or_land_command_at_s=None,
         stop_or_land_command_count=0,
         descent=replace(c.state.descent, last_commanded_raw_thrust=0.0),
-        entry=replace(c.state.entry, t_s=c.t_s, position_m=tel.position_m, yaw_rad=tel.yaw_rad),
+        entry=replace(
+            c.state.entry,
+            t_s=c.t_s,
+            vehicle_world_position_m=tel.position_m,
+            vehicle_world_yaw_rad=tel.yaw_rad,
+        ),
     )
     c = Context(state)
     return _catch_fall(c) or descend(c)
@@ -442,10 +452,10 @@ def _descend_by_setpoints(c: Context) -> Action:
     landing, state, b = c.planner.landing, c.state, c.belief
     here = make_setpoint_at_vehicle(c)
     start = here
-    if state.catch_setpoint_height_above_vehicle_m is None and state.setpoint is not None:
+    if state.fall_catch_setpoint_above_vehicle_m is None and state.setpoint is not None:
         start = state.setpoint
     start = replace(start, z_m=min(start.z_m, here.z_m))
-    x, y, _ = state.entry.position_m
+    x, y, _ = state.entry.vehicle_world_position_m
     goal = replace(start, x_m=x, y_m=y, z_m=b.ground_z_m + 0.5 * landing.handover_m)
     setpoint = step_setpoint_towards(
         c, start, goal, max_down_mps=landing.speed_mps, changes_heading=False
@@ -454,8 +464,8 @@ def _descend_by_setpoints(c: Context) -> Action:
         setpoint = replace(
             setpoint, z_m=max(setpoint.z_m, here.z_m - MAX_SETPOINT_DISTANCE_BELOW_VEHICLE_M)
         )
-    state = forget_contact_when_below(state, MIN_DISTANCE_BELOW_CONTACT_WHEN_DETACHED_M)
-    state = replace(state, setpoint=setpoint, catch_setpoint_height_above_vehicle_m=None)
+    state = forget_contact_when_below(state, MIN_DISTANCE_BELOW_CONTACT_TO_COUNT_AS_DETACHED_M)
+    state = replace(state, setpoint=setpoint, fall_catch_setpoint_above_vehicle_m=None)
     dx, dy = state.integral_setpoint_shift_world_xy_m
     sent = replace(setpoint, x_m=setpoint.x_m + dx, y_m=setpoint.y_m + dy)
     return state, limit_setpoint_to_fence_and_height_range(c, sent)
@@ -536,11 +546,14 @@ def _command_onboard_landing(c: Context) -> Action:
         and not state.stop_or_land_command_count
     ):
         return state, away
-    ends = state.stop_or_land_command_count >= MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION and not (
-        b.is_position_valid and b.height_m >= MIN_MIDAIR_MOTOR_CUT_HEIGHT_M
+    ends = (
+        state.stop_or_land_command_count >= MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION_BY_TELEMETRY
+        and not (
+            b.is_position_valid and b.height_m >= MIN_HEIGHT_TO_COUNT_MOTOR_STOP_AS_IN_FLIGHT_M
+        )
     )
-    carried = tel.acc_z_g > MAX_SPECIFIC_FORCE_IN_FALL_G or (
-        ends and tel.velocity_mps[2] > -MAX_SINK_RATE_OF_DROP_ONTO_FLOOR_MPS
+    carried = tel.acc_z_g > MAX_SPECIFIC_FORCE_TO_COUNT_AS_FALLING_G or (
+        ends and tel.velocity_mps[2] > -MAX_SINK_RATE_TO_COUNT_AS_LANDED_MPS
     )
     if (
         b.is_imu_fresh
@@ -555,19 +568,19 @@ def _command_onboard_landing(c: Context) -> Action:
         else c.t_s - state.last_stop_or_land_command_at_s
     )
     seen = (
-        state.stop_or_land_command_count >= MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION
+        state.stop_or_land_command_count >= MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION_BY_TELEMETRY
         and b.is_imu_fresh
         and tel.has_bit(HL_ACTIVE)
     )
     still_flies = (
         all(map(math.isfinite, tel.position_m))
-        and tel.thrust >= MIN_THRUST_TO_HOVER_RATIO_IF_FLYING * b.hover_thrust
+        and tel.thrust >= MIN_THRUST_TO_HOVER_RATIO_TO_COUNT_AS_FLYING * b.hover_thrust
     )
     lead_s = -math.inf
-    if b.height_m < -MIN_DEPTH_BELOW_GROUND_TO_EXTEND_LANDING_M:
-        lead_s = ONBOARD_LANDING_EXTENSION_LEAD_S
+    if b.height_m < -MIN_ESTIMATED_DEPTH_BELOW_GROUND_TO_EXTEND_LANDING_M:
+        lead_s = TIME_BEFORE_END_TO_EXTEND_ONBOARD_LANDING_S
     elif b.height_m > MIN_HEIGHT_ABOVE_GROUND_TO_EXTEND_LANDING_M:
-        lead_s = ONBOARD_LANDING_EXTENSION_LEAD_IF_ABOVE_GROUND_S
+        lead_s = TIME_BEFORE_END_TO_EXTEND_LANDING_ABOVE_GROUND_S
     extension_count = state.descent.onboard_landing_extension_count
     if (
         seen
@@ -618,5 +631,7 @@ def _complete_weight_transfer_to_magnet(c: Context) -> Action:
     if c.belief.attitude_age_s <= c.safety.telemetry_hold_s:
         return _transfer_weight_to_magnet(c)
     part = MIN_COMMANDED_TO_HOVER_THRUST_RATIO * c.belief.hover_thrust
-    thrust = int(max(KEEPALIVE_RAW_THRUST, min(MIN_FIRMWARE_POSITION_MODE_THRUST, part)))
+    thrust = int(
+        max(COMMANDED_KEEPALIVE_RAW_THRUST, min(MIN_RAW_THRUST_IN_FIRMWARE_POSITION_MODE, part))
+    )
     return replace(c.state, weight_transfer_began_at_s=c.t_s), RawThrust(thrust)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from perchctl.mission.belief.battery import (
     FIRMWARE_LOW_POWER_REPORT_DELAY_S,
-    MIN_TIME_UNDER_LOAD_FOR_BATTERY_FIT_S,
-    BatteryFit,
+    MIN_TIME_UNDER_LOAD_TO_FIT_BATTERY_MODEL_S,
+    BatteryFitState,
     PowerTrain,
     charge_fraction_from_rest_v,
     fit_battery_voltage_model,
@@ -22,18 +22,18 @@ from perchctl.mission.state import BatteryOutlook
 from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST
 
-MAX_TIME_WITHOUT_BATTERY_READING_S = 5.0
+MAX_BATTERY_READING_AGE_TO_TRUST_CHARGE_S = 5.0
 """Time without a reading after which the charge is unknown, s."""
 EXPECTED_STANDOFF_SETTLING_DURATION_S = 3.0
 """Time that settling at the stand-off takes, s, as measured in simulated flights."""
-EXPECTED_TOUCH_DURATION_S = 1.0
+EXPECTED_TOUCH_DURATION_BEYOND_CLIMB_AND_DWELL_S = 1.0
 """Time that the touch takes, s, as measured in simulated flights."""
 EXPECTED_LANDING_DURATION_BEYOND_DESCENT_S = 3.0
 """Time that a landing takes in addition to its descent, s, as measured in simulated flights."""
-MAX_DIP_BELOW_MIN_LOAD_VOLTAGE_IN_PRESS_V = 0.3
+TOLERATED_DIP_BELOW_MIN_LOAD_VOLTAGE_IN_PRESS_V = 0.3
 """Largest voltage dip below `safety.min_load_v`, V, during a press that is shorter than the
 debounce time."""
-TRUSTED_HOVER_TIME_FRACTION = 0.7
+TRUSTED_FRACTION_OF_PREDICTED_HOVER_TIME = 0.7
 """Fraction of a predicted hover time on which an attempt may rely: for worn cells near the end of
 their charge, the prediction is up to a third too long (tests/mission/test_energy.py). Larger: a
 battery that runs low may end an attempt in its ascent, or its landing may end in a fall."""
@@ -70,7 +70,7 @@ def compute_battery_outlook(c: Context) -> BatteryOutlook:
     )
 
 
-def _predict_hover_times_now(c: Context) -> HoverTimes | None:
+def _predict_hover_times_now(c: Context) -> PredictedHoverTimes | None:
     fit = c.belief.battery_fit
     thrust = c.belief.hover_thrust or FULL_THRUST * fit.mean_airborne_thrust_fraction
     power_train = identify_power_train(c.telemetry)
@@ -79,11 +79,11 @@ def _predict_hover_times_now(c: Context) -> HoverTimes | None:
 
 def _is_battery_reading_missing(c: Context) -> bool:
     without_reading_s = c.belief.battery_fit.time_since_battery_reading_s
-    return without_reading_s > MAX_TIME_WITHOUT_BATTERY_READING_S
+    return without_reading_s > MAX_BATTERY_READING_AGE_TO_TRUST_CHARGE_S
 
 
 def _time_until_landing_must_begin_s(
-    c: Context, hover_times: HoverTimes | None, landing_duration_s: float
+    c: Context, hover_times: PredictedHoverTimes | None, landing_duration_s: float
 ) -> float:
     """Return the time, s, that is left for attempts before a landing must begin; negative if the
     landing is overdue. It follows from the predicted `hover_times`. Without a recent battery
@@ -100,7 +100,7 @@ def _time_until_landing_must_begin_s(
 
 
 @dataclass(frozen=True)
-class HoverTimes:
+class PredictedHoverTimes:
     """Predicted times that the vehicle can hover from now on, s: until row `battery-low` lands it,
     and until the voltage in hover falls below `safety.min_load_v`."""
 
@@ -112,19 +112,22 @@ class HoverTimes:
         if it is overdue. It is the smaller of two times: until row `battery-low` lands the vehicle;
         and until the voltage in hover falls below `safety.min_load_v`, less `landing_duration_s`
         and `reserve_s`. The landing is not subtracted from the time until `battery-low`, since the
-        motors keep running at low power. Only `TRUSTED_HOVER_TIME_FRACTION` of each predicted time
-        is counted."""
+        motors keep running at low power. Only `TRUSTED_FRACTION_OF_PREDICTED_HOVER_TIME` of each
+        predicted time is counted."""
         return min(
-            TRUSTED_HOVER_TIME_FRACTION * self.until_battery_low_s,
-            TRUSTED_HOVER_TIME_FRACTION * self.until_min_load_voltage_s
+            TRUSTED_FRACTION_OF_PREDICTED_HOVER_TIME * self.until_battery_low_s,
+            TRUSTED_FRACTION_OF_PREDICTED_HOVER_TIME * self.until_min_load_voltage_s
             - landing_duration_s
             - reserve_s,
         )
 
 
 def predict_hover_times(
-    battery_fit: BatteryFit, profile: Profile, hover_thrust_fraction: float, power_train: PowerTrain
-) -> HoverTimes | None:
+    battery_fit: BatteryFitState,
+    profile: Profile,
+    hover_thrust_fraction: float,
+    power_train: PowerTrain,
+) -> PredictedHoverTimes | None:
     """Predict the hover times at a constant `hover_thrust_fraction` (fraction of full thrust), for
     motors with the current and the low-power voltage of `power_train`. Return None if that fraction
     is not positive, or if the battery fit has no resting voltage or has not seen enough time under
@@ -138,11 +141,12 @@ def predict_hover_times(
     `FIRMWARE_LOW_POWER_REPORT_DELAY_S` after the voltage in hover has fallen to the firmware's
     limit; the voltage in hover falls below `safety.min_load_v`; or, in a mission that perches, a
     press would pull the voltage below `safety.min_load_v`. A press that is shorter than
-    `safety.battery_debounce_s` may pull it lower, by `MAX_DIP_BELOW_MIN_LOAD_VOLTAGE_IN_PRESS_V`.
+    `safety.battery_debounce_s` may pull it lower, by
+    `TOLERATED_DIP_BELOW_MIN_LOAD_VOLTAGE_IN_PRESS_V`.
     """
     if (
         battery_fit.rest_v is None
-        or battery_fit.time_under_load_s < MIN_TIME_UNDER_LOAD_FOR_BATTERY_FIT_S
+        or battery_fit.time_under_load_s < MIN_TIME_UNDER_LOAD_TO_FIT_BATTERY_MODEL_S
         or not hover_thrust_fraction > 0.0
     ):
         return None
@@ -150,8 +154,13 @@ def predict_hover_times(
     low_power_v = float(
         profile.link.parameters.get("pm.lowVoltage", power_train.low_power_warning_v)
     )
-    lasts = EXPECTED_TOUCH_DURATION_S + perch.contact_dwell_s > safety.battery_debounce_s
-    press_v = safety.min_load_v - (0.0 if lasts else MAX_DIP_BELOW_MIN_LOAD_VOLTAGE_IN_PRESS_V)
+    lasts = (
+        EXPECTED_TOUCH_DURATION_BEYOND_CLIMB_AND_DWELL_S + perch.contact_dwell_s
+        > safety.battery_debounce_s
+    )
+    press_v = safety.min_load_v - (
+        0.0 if lasts else TOLERATED_DIP_BELOW_MIN_LOAD_VOLTAGE_IN_PRESS_V
+    )
     press_load = max(hover_thrust_fraction, max_press_thrust(profile) / FULL_THRUST)
     sag_v, discharge_ratio = fit_battery_voltage_model(battery_fit)
     charge_fraction = charge_fraction_from_rest_v(battery_fit.rest_v)
@@ -172,11 +181,13 @@ def predict_hover_times(
     )
     if profile.planner.hover is None:
         battery_low_s = min(battery_low_s, until_s(press_v, press_load))
-    return HoverTimes(until_battery_low_s=battery_low_s, until_min_load_voltage_s=min_load_v_s)
+    return PredictedHoverTimes(
+        until_battery_low_s=battery_low_s, until_min_load_voltage_s=min_load_v_s
+    )
 
 
 @dataclass(frozen=True)
-class MissionDurations:
+class PredictedMissionDurations:
     """Predicted times, s, that the rest of this attempt, each further attempt and the landing
     take."""
 
@@ -185,7 +196,7 @@ class MissionDurations:
     landing_duration_s: float
 
 
-def predict_mission_durations(c: Context) -> MissionDurations:
+def predict_mission_durations(c: Context) -> PredictedMissionDurations:
     """Predict the times, s, that the rest of this attempt, each retry and the landing take, from
     the target's height, the speeds in the profile, and typical times of the stages without a set
     speed. The position of the target must be known. In a mission that hovers below the target, its
@@ -197,7 +208,7 @@ def predict_mission_durations(c: Context) -> MissionDurations:
     climb_height_m = max(0.0, top_z_m - c.telemetry.position_m[2])
     touch_s = EXPECTED_STANDOFF_SETTLING_DURATION_S + planner.ascend.settle_dwell_s
     if hover is None:
-        touch_s += EXPECTED_TOUCH_DURATION_S
+        touch_s += EXPECTED_TOUCH_DURATION_BEYOND_CLIMB_AND_DWELL_S
         touch_s += (
             planner.ascend.standoff_m / planner.perch.climb_mps + planner.perch.contact_dwell_s
         )
@@ -212,7 +223,7 @@ def predict_mission_durations(c: Context) -> MissionDurations:
         )
     retry_climb_m = planner.recover.descend_m + planner.ascend.standoff_m
     descent_s = max(0.0, c.belief.height_m + climb_height_m) / planner.landing.speed_mps
-    return MissionDurations(
+    return PredictedMissionDurations(
         remaining_attempt_duration_s=aligned_s
         + _climb_duration_s(c.profile, climb_height_m)
         + touch_s,

@@ -6,7 +6,7 @@ from perchctl.mission.belief.maneuver import Maneuver
 from perchctl.mission.belief.update import has_tick_gap, update_belief
 from perchctl.mission.observation import Observation
 from perchctl.mission.phase import Phase
-from perchctl.mission.release import CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M
+from perchctl.mission.release import FALL_CATCH_SETPOINT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M
 from perchctl.mission.state import PlannerState
 from perchctl.profile import Profile
 from perchctl.values import replace
@@ -26,11 +26,11 @@ def update_state_with_observation(
     if has_tick_gap(state.belief, obs, profile):
         # The setpoint of a catch is far above the vehicle; keeping it would make the vehicle press
         # against the ceiling.
-        setpoint = state.setpoint if state.catch_setpoint_height_above_vehicle_m is None else None
+        setpoint = state.setpoint if state.fall_catch_setpoint_above_vehicle_m is None else None
         state = replace(
             state,
             condition_start_times_s={},
-            catch_setpoint_height_above_vehicle_m=None,
+            fall_catch_setpoint_above_vehicle_m=None,
             setpoint=setpoint,
         )
     known = state.belief.last_telemetry is not None
@@ -59,12 +59,14 @@ def _apply_world_frame_shift(state: PlannerState) -> PlannerState:
             entry=replace(state.entry, t_s=b.obs.t_s),
             stop_or_land_command_count=0,
             last_stop_or_land_command_at_s=None,
-            catch_setpoint_height_above_vehicle_m=CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M,
+            fall_catch_setpoint_above_vehicle_m=FALL_CATCH_SETPOINT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M,
         )
     return replace(
         state,
         setpoint=b.command_history.setpoint,
-        entry=replace(state.entry, position_m=b.command_history.maneuver_start_position_m),
+        entry=replace(
+            state.entry, vehicle_world_position_m=b.command_history.maneuver_start_position_m
+        ),
         vehicle_world_z_when_blocked_m=None
         if vehicle_world_z_when_blocked_m is None
         else vehicle_world_z_when_blocked_m + b.world_frame_shift_in_tick_m[2],

@@ -22,7 +22,7 @@ from perchctl.mission.endurance import compute_battery_outlook
 from perchctl.mission.observation import Observation
 from perchctl.mission.observe import update_state_with_observation
 from perchctl.mission.phase import Phase, Severity
-from perchctl.mission.phases.approach import MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M
+from perchctl.mission.phases.approach import MIN_HEIGHT_TO_CORRECT_SETPOINT_HEIGHT_M
 from perchctl.mission.phases.hover import is_hovering
 from perchctl.mission.setpoints import Action, fly_to, lower_held_setpoint
 from perchctl.mission.state import PhaseEntry, PlannerState
@@ -54,11 +54,13 @@ def step_mission(
     c = Context(state)
     row = find_first_matching_transition(c, table)
     if row is None:
-        state = replace(state, waiting_reason="")
+        state = replace(state, wait_in_phase_reason="")
     elif row.keeps_mission_in(state.phase):
         total_wait_in_phase_s = state.total_wait_in_phase_s + obs.t_s - state.t_s
         state = replace(
-            state, waiting_reason=row.reason_text(c), total_wait_in_phase_s=total_wait_in_phase_s
+            state,
+            wait_in_phase_reason=row.reason_text(c),
+            total_wait_in_phase_s=total_wait_in_phase_s,
         )
     else:
         state = _enter_phase(c, row)
@@ -124,8 +126,8 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
         phase=row.to,
         entry=PhaseEntry(
             t_s=c.t_s,
-            position_m=c.telemetry.position_m,
-            yaw_rad=c.telemetry.yaw_rad,
+            vehicle_world_position_m=c.telemetry.position_m,
+            vehicle_world_yaw_rad=c.telemetry.yaw_rad,
             transition_name=row.name,
             reason=row.reason_text(c),
             diagnosis=row.diagnosis,
@@ -135,12 +137,12 @@ def _enter_phase(c: Context, row: Transition) -> PlannerState:
         outcome=row.outcome_after_transition(state.outcome),
         condition_start_times_s={},
         failed_attempts=state.failed_attempts + int(row.severity is Severity.BACK_OFF),
-        waiting_reason="",
+        wait_in_phase_reason="",
         total_wait_in_phase_s=0.0,
         search_step_began_at_s=c.t_s,
         consecutive_target_frames=0,
         must_end_press=ends
-        and state.catch_setpoint_height_above_vehicle_m is None
+        and state.fall_catch_setpoint_above_vehicle_m is None
         and presses_against_target,
         last_stop_or_land_command_at_s=None,
         stop_or_land_command_count=0,
@@ -156,12 +158,12 @@ def act_in_phase(c: Context) -> Action:
     # A fall is caught and a press ended even during a hold, since the setpoint is above the
     # vehicle.
     leaves = state.phase is Phase.RECOVER and (
-        state.must_end_press or state.catch_setpoint_height_above_vehicle_m is not None
+        state.must_end_press or state.fall_catch_setpoint_above_vehicle_m is not None
     )
     if state.hold_reason and state.setpoint is not None and not leaves:
         corrects_height = (
             state.phase is not Phase.APPROACH
-            or c.belief.height_m > MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M
+            or c.belief.height_m > MIN_HEIGHT_TO_CORRECT_SETPOINT_HEIGHT_M
         )
         return fly_to(c, lower_held_setpoint(c, state.setpoint), corrects_height=corrects_height)
     return PHASES[state.phase].act(c)

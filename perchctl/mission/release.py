@@ -1,7 +1,7 @@
 """Actions at the ceiling: end of a press, release onto the magnet, motor stop, and catch.
 
 In position mode, the onboard controller never commands less than
-`MIN_FIRMWARE_POSITION_MODE_THRUST`. Raw thrust can be reduced until the motors stop turning
+`MIN_RAW_THRUST_IN_FIRMWARE_POSITION_MODE`. Raw thrust can be reduced until the motors stop turning
 (docs/firmware.md, "Release in raw mode"): the whole weight is transferred to the magnet and
 monitored before the motors are stopped.
 """
@@ -9,8 +9,8 @@ monitored before the motors are stopped.
 from __future__ import annotations
 
 from perchctl.mission.belief.contact import HANGING_WITH_MOTORS_STOPPED, is_thrust_above_hover
-from perchctl.mission.belief.thrust import MIN_FIRMWARE_POSITION_MODE_THRUST
-from perchctl.mission.belief.update import KEEPALIVE_RAW_THRUST
+from perchctl.mission.belief.thrust import MIN_RAW_THRUST_IN_FIRMWARE_POSITION_MODE
+from perchctl.mission.belief.update import COMMANDED_KEEPALIVE_RAW_THRUST
 from perchctl.mission.context import Context
 from perchctl.mission.setpoints import (
     Action,
@@ -25,7 +25,7 @@ from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
 # --- end of a press ---
 MIN_DISTANCE_BELOW_CONTACT_TO_END_PRESS_M = 0.08
 """Distance below the contact beyond which the vehicle has left it, m."""
-MAX_CLIMB_RATE_WHEN_FALLING_AFTER_PRESS_MPS = -0.3
+MAX_CLIMB_RATE_TO_COUNT_AS_FALLING_AFTER_PRESS_MPS = -0.3
 """Climb rate below which a vehicle that ends its press is falling, m/s; the setpoint then stays at
 the vehicle."""
 INTEGRATOR_UNWIND_SETPOINT_BELOW_VEHICLE_IN_PRESS_M = 1.0
@@ -43,7 +43,7 @@ MAX_PRESS_DURATION_FOR_GRADUAL_RELEASE_S = 1.5
 at once instead of in steps: by then, the onboard integrator has wound up, and it unwinds slowly by
 itself. Larger: a press whose contact is proven late, because the thrust was not reported, lasts
 longer than 4 s."""
-REDUCED_PRESS_TO_MAGNET_HOLD_PROOF_THRUST_RATIO = 0.9
+COMMANDED_FRACTION_OF_MAX_THRUST_THAT_PROVES_HANGING = 0.9
 """The raw thrust of a press is lowered to this fraction of `complete.hold_ratio` times hover
 thrust, the largest thrust that proves that the magnet holds the vehicle (too little to fly)."""
 EXTRA_HANGING_DWELL_IF_THRUST_UNCONFIRMED_S = 1.5
@@ -58,12 +58,12 @@ MOTOR_STOP_COMMAND_PERIOD_WHILE_THRUST_REPORTED_S = 0.5
 """Time after which one more stop command is sent while the telemetry shows thrust, s."""
 
 # --- catch ---
-CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M = 1.0
+FALL_CATCH_SETPOINT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M = 1.0
 """Height of the setpoint above a falling vehicle whose motors have stopped, m."""
-CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_ON_M = 0.2
+FALL_CATCH_SETPOINT_ABOVE_VEHICLE_WITH_MOTORS_ON_M = 0.2
 """Height of the setpoint above a falling vehicle whose motors are running, m: full thrust would
 carry it to the ceiling."""
-MIN_THRUST_TO_HOVER_RATIO_IF_MOTORS_ON = 0.5
+MIN_THRUST_TO_HOVER_RATIO_TO_COUNT_MOTORS_AS_ON = 0.5
 """Fraction of hover thrust above which the motors count as running."""
 MIN_FALL_CATCH_DURATION_S = 0.1
 """Shortest duration of a catch, s."""
@@ -74,7 +74,7 @@ MIN_CLIMB_RATE_TO_END_FALL_CATCH_MPS = -0.1
 MAX_LATERAL_SPEED_BRAKED_IN_FALL_CATCH_MPS = 1.0
 """Largest lateral speed that is braked, m/s; no impact that the vehicle survives leaves a
 higher one."""
-ONBOARD_POSITION_GAIN_PER_S = 2.0
+ONBOARD_POSITION_TO_VELOCITY_GAIN_PER_S = 2.0
 """Gains `posCtlPid.xKp` and `yKp` of the firmware, 1/s."""
 
 
@@ -83,14 +83,14 @@ def end_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     onboard integrators have unwound. The setpoint is None after that, after `PRESS_END_TIMEOUT_S`
     in the phase, or if the phase did not begin with a press (`must_end_press` is False)."""
     state, tel = c.state, c.telemetry
-    x, y, z = state.entry.position_m
+    x, y, z = state.entry.vehicle_world_position_m
     if not state.must_end_press:
         return state, None
     away_m = z - tel.position_m[2]
     calm = (
         away_m > MIN_DISTANCE_BELOW_CONTACT_TO_END_PRESS_M
         and not is_thrust_above_hover(c.belief)
-        and tel.velocity_mps[2] > MAX_CLIMB_RATE_WHEN_FALLING_AFTER_PRESS_MPS
+        and tel.velocity_mps[2] > MAX_CLIMB_RATE_TO_COUNT_AS_FALLING_AFTER_PRESS_MPS
     )
     if calm or c.time_in_phase_s > PRESS_END_TIMEOUT_S:
         return replace(state, must_end_press=False), None
@@ -99,11 +99,14 @@ def end_press(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
         if away_m < MIN_DISTANCE_BELOW_CONTACT_TO_END_PRESS_M
         else INTEGRATOR_UNWIND_SETPOINT_BELOW_VEHICLE_IN_AIR_M
     )
-    if tel.velocity_mps[2] < MAX_CLIMB_RATE_WHEN_FALLING_AFTER_PRESS_MPS:
+    if tel.velocity_mps[2] < MAX_CLIMB_RATE_TO_COUNT_AS_FALLING_AFTER_PRESS_MPS:
         setpoint_below_vehicle_m = 0.0
     dx, dy = state.integral_setpoint_shift_world_xy_m
     setpoint = PositionSetpoint(
-        x + dx, y + dy, tel.position_m[2] - setpoint_below_vehicle_m, state.entry.yaw_rad
+        x + dx,
+        y + dy,
+        tel.position_m[2] - setpoint_below_vehicle_m,
+        state.entry.vehicle_world_yaw_rad,
     )
     return state, limit_setpoint_to_fence_and_height_range(c, setpoint)
 
@@ -130,7 +133,9 @@ def reduce_press_before_weight_transfer(c: Context) -> Action:
         if not b.is_imu_fresh:
             return hold_contact_by_position(c)
         lowest = (
-            REDUCED_PRESS_TO_MAGNET_HOLD_PROOF_THRUST_RATIO * complete.hold_ratio * b.hover_thrust
+            COMMANDED_FRACTION_OF_MAX_THRUST_THAT_PROVES_HANGING
+            * complete.hold_ratio
+            * b.hover_thrust
         )
         return state, RawThrust(int(perch.thrust + part * (lowest - perch.thrust)))
     setpoint = state.setpoint or make_setpoint_at_vehicle(c)
@@ -140,7 +145,7 @@ def reduce_press_before_weight_transfer(c: Context) -> Action:
         if b.is_position_valid
         else c.telemetry.position_m[2] - b.vehicle_world_z_at_last_contact_m
     )
-    top = state.entry.position_m[2] + perch.press_m + slid_m
+    top = state.entry.vehicle_world_position_m[2] + perch.press_m + slid_m
     low = b.vehicle_world_z_at_last_contact_m - complete.release_drop_m + slid_m
     setpoint = replace(setpoint, z_m=top + part * (low - top))
     sent = limit_setpoint_to_fence_and_height_range(
@@ -178,15 +183,19 @@ def transfer_weight_by_raw_thrust(c: Context, *, max_stale_telemetry_age_s: floa
     if hung_s >= complete.hang_s + extra_s:
         return stop_motors(c)
     part = min(1.0, (c.t_s - weight_transfer_began_at_s) / complete.ramp_s)
-    start = c.planner.perch.thrust if state.setpoint is None else MIN_FIRMWARE_POSITION_MODE_THRUST
-    start = min(start, MIN_FIRMWARE_POSITION_MODE_THRUST)
-    return state, RawThrust(int(start + part * (KEEPALIVE_RAW_THRUST - start)))
+    start = (
+        c.planner.perch.thrust
+        if state.setpoint is None
+        else MIN_RAW_THRUST_IN_FIRMWARE_POSITION_MODE
+    )
+    start = min(start, MIN_RAW_THRUST_IN_FIRMWARE_POSITION_MODE)
+    return state, RawThrust(int(start + part * (COMMANDED_KEEPALIVE_RAW_THRUST - start)))
 
 
 def hold_contact_by_position(c: Context) -> Action:
     """Command a position setpoint above the vehicle while the telemetry is old, to stay in contact
     or to catch an undetected fall. The setpoint is
-    `CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_ON_M` above the recorded contact or, without a
+    `FALL_CATCH_SETPOINT_ABOVE_VEHICLE_WITH_MOTORS_ON_M` above the recorded contact or, without a
     contact or a valid position, above the vehicle's last reported height. The weight transfer then
     starts over."""
     state, tel, b = c.state, c.telemetry, c.belief
@@ -194,7 +203,7 @@ def hold_contact_by_position(c: Context) -> Action:
     if b.vehicle_world_z_at_last_contact_m is not None and b.is_position_valid:
         z_m = b.vehicle_world_z_at_last_contact_m
     setpoint = PositionSetpoint(
-        x, y, z_m + CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_ON_M, tel.yaw_rad
+        x, y, z_m + FALL_CATCH_SETPOINT_ABOVE_VEHICLE_WITH_MOTORS_ON_M, tel.yaw_rad
     )
     return replace(
         state, setpoint=setpoint, weight_transfer_began_at_s=None
@@ -243,17 +252,17 @@ def stop_motors(c: Context) -> Action:
     return state, Idle()
 
 
-def choose_catch_setpoint_height_above_vehicle_m(
+def choose_fall_catch_setpoint_above_vehicle_m(
     hover_thrust: float, reported_thrust: float
 ) -> float:
     """Return how far above a falling vehicle, m, a setpoint must be to catch the fall. The height
     is smaller if the motors are turning, that is, if the reported thrust exceeds
-    `MIN_THRUST_TO_HOVER_RATIO_IF_MOTORS_ON` times hover thrust (both 0..65535)."""
-    turning = reported_thrust > MIN_THRUST_TO_HOVER_RATIO_IF_MOTORS_ON * hover_thrust
+    `MIN_THRUST_TO_HOVER_RATIO_TO_COUNT_MOTORS_AS_ON` times hover thrust (both 0..65535)."""
+    turning = reported_thrust > MIN_THRUST_TO_HOVER_RATIO_TO_COUNT_MOTORS_AS_ON * hover_thrust
     return (
-        CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_ON_M
+        FALL_CATCH_SETPOINT_ABOVE_VEHICLE_WITH_MOTORS_ON_M
         if turning
-        else CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M
+        else FALL_CATCH_SETPOINT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M
     )
 
 
@@ -263,7 +272,7 @@ def catch_falling_vehicle(c: Context) -> Action | None:
     after `MIN_FALL_CATCH_DURATION_S`, once the climb rate is at least
     `MIN_CLIMB_RATE_TO_END_FALL_CATCH_MPS`, and in any case after `MAX_FALL_CATCH_DURATION_S`."""
     state, tel, b = c.state, c.telemetry, c.belief
-    if state.catch_setpoint_height_above_vehicle_m is None or not b.is_imu_fresh:
+    if state.fall_catch_setpoint_above_vehicle_m is None or not b.is_imu_fresh:
         return None
     begun = c.time_in_phase_s < MIN_FALL_CATCH_DURATION_S
     if begun or (
@@ -273,13 +282,13 @@ def catch_falling_vehicle(c: Context) -> Action | None:
         x, y = (
             _braking_setpoint_world_xy_m(c)
             if b.is_estimate_missing_gust
-            else state.entry.position_m[:2]
+            else state.entry.vehicle_world_position_m[:2]
         )
         setpoint = PositionSetpoint(
             x,
             y,
-            tel.position_m[2] + state.catch_setpoint_height_above_vehicle_m,
-            state.entry.yaw_rad,
+            tel.position_m[2] + state.fall_catch_setpoint_above_vehicle_m,
+            state.entry.vehicle_world_yaw_rad,
         )
         return replace(state, setpoint=setpoint), limit_setpoint_to_fence_and_height_range(
             c, setpoint
@@ -292,7 +301,7 @@ def _braking_setpoint_world_xy_m(c: Context) -> tuple[float, float]:
     shows and the state estimate does not (the difference between the two). The setpoint is behind
     the vehicle, opposite to this velocity, by the velocity (at most
     `MAX_LATERAL_SPEED_BRAKED_IN_FALL_CATCH_MPS` per axis) divided by
-    `ONBOARD_POSITION_GAIN_PER_S`."""
+    `ONBOARD_POSITION_TO_VELOCITY_GAIN_PER_S`."""
     tel, reckoned_mps = c.telemetry, c.belief.dead_reckoning.velocity_world_mps
     missing_mps = (reckoned_mps[i] - tel.velocity_mps[i] for i in range(2))
     x_mps, y_mps = (
@@ -303,7 +312,10 @@ def _braking_setpoint_world_xy_m(c: Context) -> tuple[float, float]:
         for mps in missing_mps
     )
     x_m, y_m, _ = tel.position_m
-    return x_m - x_mps / ONBOARD_POSITION_GAIN_PER_S, y_m - y_mps / ONBOARD_POSITION_GAIN_PER_S
+    return (
+        x_m - x_mps / ONBOARD_POSITION_TO_VELOCITY_GAIN_PER_S,
+        y_m - y_mps / ONBOARD_POSITION_TO_VELOCITY_GAIN_PER_S,
+    )
 
 
 def forget_contact_when_below(

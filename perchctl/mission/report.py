@@ -22,17 +22,17 @@ from perchctl.vision import CameraCalibrationErrors
 
 MIN_HARD_TOUCHDOWN_SPEED_MPS = 0.6
 """Touchdown speed above which a landing is hard, m/s; no normal descent is faster."""
-MAX_TIME_FROM_TOUCHDOWN_TO_MOTOR_STOP_S = 5.0
+MAX_TIME_BEFORE_MOTOR_STOP_TO_COUNT_AS_TOUCHDOWN_S = 5.0
 """Longest time from a touchdown to the stop of the motors, s; an earlier impact was not the
 floor."""
-MAX_TOUCHDOWN_HEIGHT_ABOVE_FINAL_POSITION_M = 0.3
+MAX_HEIGHT_ABOVE_FINAL_POSITION_TO_COUNT_AS_TOUCHDOWN_M = 0.3
 """Largest height of an impact above the final position for it to be a touchdown, m."""
 SIGMAS_FOR_95_PERCENT_INTERVAL = 1.96
 """Half width of a 95 % interval, in standard deviations."""
-MIN_REPORTED_LATENCY_ERROR_S = 0.02
+MIN_LATENCY_ERROR_TO_GIVE_ADVICE_S = 0.02
 """Latency error above which the report gives advice, s: an error of 30 ms makes the alignment
 oscillate by centimetres."""
-MIN_REPORTED_ROTATION_ERROR_DEG = 2.0
+MIN_ROTATION_ERROR_TO_GIVE_ADVICE_DEG = 2.0
 """Rotation error above which the report gives advice, deg: 2 deg are 35 mm at 1 m, more than the
 cone of an ascent allows."""
 
@@ -88,10 +88,10 @@ class CameraFindings:
         simulated: bool = False,
     ) -> CameraFindings:
         """Return the findings from a flight's estimates `camera_errors`, with `camera` as in the
-        profile. There is advice on each error above its limit (`MIN_REPORTED_LATENCY_ERROR_S`,
-        `MIN_REPORTED_ROTATION_ERROR_DEG`) that is also larger than the full width of its 95 %
-        interval, but none on a latency that the profile leaves to be measured, and none at all if
-        the flight was `simulated`."""
+        profile. There is advice on each error above its limit
+        (`MIN_LATENCY_ERROR_TO_GIVE_ADVICE_S`, `MIN_ROTATION_ERROR_TO_GIVE_ADVICE_DEG`) that is also
+        larger than the full width of its 95 % interval, but none on a latency that the profile
+        leaves to be measured, and none at all if the flight was `simulated`."""
         latency_s = camera.start_latency_s + camera_errors.latency_above_profile_s
         x, y, z = (math.degrees(turn) for turn in camera_errors.mount_rotation_from_profile_xyz_rad)
         sx, sy, sz = (math.degrees(sigma) for sigma in camera_errors.mount_rotation_sigma_xyz_rad)
@@ -101,7 +101,7 @@ class CameraFindings:
         set_here = not isinstance(camera.latency_s, str)  # otherwise the measured latency is used
         if set_here and _is_significant(
             camera_errors.latency_above_profile_s,
-            MIN_REPORTED_LATENCY_ERROR_S,
+            MIN_LATENCY_ERROR_TO_GIVE_ADVICE_S,
             camera_errors.latency_sigma_s,
         ):
             advice.append(
@@ -114,7 +114,8 @@ class CameraFindings:
             strict=True,
         )
         if any(
-            _is_significant(turn, MIN_REPORTED_ROTATION_ERROR_DEG, sigma) for turn, sigma in turns
+            _is_significant(turn, MIN_ROTATION_ERROR_TO_GIVE_ADVICE_DEG, sigma)
+            for turn, sigma in turns
         ):
             advice.append(
                 f"the camera is rotated by {found.rotation_text} relative to the profile: measure "
@@ -153,8 +154,8 @@ def _is_significant(difference: float, threshold: float, sigma: float) -> bool:
 @dataclass(frozen=True)
 class HoverReport:
     """Duration of a hover below the target, s, the intended distance of the gear below the target,
-    m, and the RMS errors as the camera measured them (`HoverErrors`): x forward, y left and z up in
-    the level frame, m, and heading, rad."""
+    m, and the RMS errors as the camera measured them (`HoverErrorAccumulator`): x forward, y left
+    and z up in the level frame, m, and heading, rad."""
 
     duration_s: float
     hover_distance_below_target_m: float
@@ -168,7 +169,7 @@ class HoverReport:
         hover, errors = profile.planner.hover, state.hover_errors
         if hover is None or not errors.frame_count:
             return None
-        x_m, y_m, z_m, yaw_rad = errors.rms_xyz_yaw
+        x_m, y_m, z_m, yaw_rad = errors.rms_level_xyz_m_yaw_rad
         return cls(errors.duration_s, hover.below_m, (x_m, y_m, z_m), yaw_rad)
 
     @property
@@ -288,9 +289,9 @@ def report_rest_state(
 
 def find_touchdown(c: Context) -> Touchdown | None:
     """Return the newest impact from below if it may be the touchdown. Return None if the vehicle is
-    perched, if the impact was more than `MAX_TIME_FROM_TOUCHDOWN_TO_MOTOR_STOP_S` before the motors
-    stopped (or before now, if they are still turning), or if a valid position shows that it was too
-    far above the final position.
+    perched, if the impact was more than `MAX_TIME_BEFORE_MOTOR_STOP_TO_COUNT_AS_TOUCHDOWN_S` before
+    the motors stopped (or before now, if they are still turning), or if a valid position shows that
+    it was too far above the final position.
 
     The downward speed, m/s, comes from dead reckoning if that has replaced the state estimate or if
     positions have diverged; otherwise, it comes from the state estimate.
@@ -301,19 +302,22 @@ def find_touchdown(c: Context) -> Touchdown | None:
     if (
         c.state.phase is Phase.PERCHED
         or min(tel.t_s, imu.motors_stopped_at_s) - impact.t_s
-        > MAX_TIME_FROM_TOUCHDOWN_TO_MOTOR_STOP_S
+        > MAX_TIME_BEFORE_MOTOR_STOP_TO_COUNT_AS_TOUCHDOWN_S
     ):
         return None
-    higher = impact.world_z_m - tel.position_m[2] > MAX_TOUCHDOWN_HEIGHT_ABOVE_FINAL_POSITION_M
+    higher = (
+        impact.world_z_m - tel.position_m[2]
+        > MAX_HEIGHT_ABOVE_FINAL_POSITION_TO_COUNT_AS_TOUCHDOWN_M
+    )
     if b.is_position_valid and b.dead_reckoning_began_at_s is None and higher:
         return None
     reckoned = b.dead_reckoning_began_at_s is not None or b.is_position_diverged
     speed_mps = -(
-        dead_reckoning.climb_before_impact_mps
+        dead_reckoning.climb_rate_before_newest_impact_mps
         if reckoned
-        else impact.estimated_climb_before_impact_mps
+        else impact.estimated_climb_rate_before_impact_mps
     )
-    return Touchdown(max(0.0, speed_mps), impact.peak_acc_z_g)
+    return Touchdown(max(0.0, speed_mps), impact.peak_specific_force_body_z_g)
 
 
 def _flight_end_reason(state: PlannerState, history: tuple[Event, ...]) -> str:

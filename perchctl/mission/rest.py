@@ -11,15 +11,15 @@ from perchctl.mission.belief.target import MIN_GEAR_TO_TARGET_Z_TO_EXCLUDE_HANGI
 from perchctl.mission.context import Context
 from perchctl.mission.phase import Phase, VehicleDiagnosis
 
-MAX_HEIGHT_DRIFT_BELOW_CONTACT_IF_HANGING_M = 0.3
+MAX_DISTANCE_BELOW_CONTACT_TO_COUNT_AS_HANGING_M = 0.3
 """Largest distance below its contact at which a vehicle counts as still hanging, m; allows for
 drift of the estimate."""
 MIN_HEIGHT_TO_INFER_HANGING_M = 0.45
 """Height above which hanging can be distinguished from standing on the floor, m; it is compared
 with the height at the start of a descent or with the present height."""
-MAX_HEIGHT_RESTING_ON_FLOOR_M = 0.3
+MAX_HEIGHT_TO_COUNT_AS_ON_FLOOR_M = 0.3
 """Height up to which a vehicle with its motors off counts as being on the floor, m."""
-MAX_HEIGHT_LOSS_IF_STILL_HANGING_M = 0.15
+MAX_HEIGHT_LOSS_TO_COUNT_AS_STILL_HANGING_M = 0.15
 """Height loss below which a vehicle counts as still hanging where the descent began, m. Larger: a
 vehicle on a table seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to have
 come off."""
@@ -49,9 +49,9 @@ def find_rest_state(c: Context) -> RestState:
       estimate starts again at the origin, so earlier positions and sightings are not used.
     - All other cases: HANGS if the target is not known to be too far above to hold the vehicle, and
       the height shows that it has not come down. This is so if it has lost less than
-      `MAX_HEIGHT_LOSS_IF_STILL_HANGING_M` of height in the present phase, which began more than
-      `MIN_HEIGHT_TO_INFER_HANGING_M` above the ground, or if a contact is recorded and it is more
-      than `MAX_HEIGHT_RESTING_ON_FLOOR_M` above the ground. STANDS otherwise.
+      `MAX_HEIGHT_LOSS_TO_COUNT_AS_STILL_HANGING_M` of height in the present phase, which began more
+      than `MIN_HEIGHT_TO_INFER_HANGING_M` above the ground, or if a contact is recorded and it is
+      more than `MAX_HEIGHT_TO_COUNT_AS_ON_FLOOR_M` above the ground. STANDS otherwise.
     """
     b, state = c.belief, c.state
     if _is_held_by_other_object(c):
@@ -62,18 +62,18 @@ def find_rest_state(c: Context) -> RestState:
         if is_seen and b.target.is_too_far_above_to_hold_vehicle:
             return RestState.STANDS
         return _find_rest_state_from_measured_falls(c)
-    high = state.entry.position_m[2] - b.ground_z_m > MIN_HEIGHT_TO_INFER_HANGING_M
-    came_down_m = state.entry.position_m[2] - b.telemetry.position_m[2]
+    high = state.entry.vehicle_world_position_m[2] - b.ground_z_m > MIN_HEIGHT_TO_INFER_HANGING_M
+    came_down_m = state.entry.vehicle_world_position_m[2] - b.telemetry.position_m[2]
     stayed = (
         high
         and not b.target.is_too_far_above_to_hold_vehicle
-        and came_down_m < MAX_HEIGHT_LOSS_IF_STILL_HANGING_M
+        and came_down_m < MAX_HEIGHT_LOSS_TO_COUNT_AS_STILL_HANGING_M
     )
     at_contact = (
         b.vehicle_world_z_at_last_contact_m is not None
         and not b.target.is_too_far_above_to_hold_vehicle
     )
-    if stayed or (b.height_m > MAX_HEIGHT_RESTING_ON_FLOOR_M and at_contact):
+    if stayed or (b.height_m > MAX_HEIGHT_TO_COUNT_AS_ON_FLOOR_M and at_contact):
         return RestState.HANGS
     return RestState.STANDS
 
@@ -84,8 +84,8 @@ def _is_held_by_other_object(c: Context) -> bool:
         return False
     if (
         b.is_position_valid
-        and state.entry.position_m[2] - b.telemetry.position_m[2]
-        >= MAX_HEIGHT_LOSS_IF_STILL_HANGING_M
+        and state.entry.vehicle_world_position_m[2] - b.telemetry.position_m[2]
+        >= MAX_HEIGHT_LOSS_TO_COUNT_AS_STILL_HANGING_M
     ):
         return False
     if VehicleDiagnosis.HELD_BY_OTHER_OBJECT in state.entry.diagnosis:
@@ -137,10 +137,10 @@ def is_still_hanging(c: Context) -> bool:
     """True if the height or the accelerometer shows that the vehicle is still hanging.
 
     The height shows it if a deck or motion capture gives a valid position, a contact is recorded,
-    and the vehicle is at most `MAX_HEIGHT_DRIFT_BELOW_CONTACT_IF_HANGING_M` below that contact and
-    not sinking faster than `complete.slip_mps`. The accelerometer shows it if it has measured no
-    fall since the vehicle came within the magnet's reach, and no gap in the telemetry can hide one
-    (`_find_rest_state_from_measured_falls`).
+    and the vehicle is at most `MAX_DISTANCE_BELOW_CONTACT_TO_COUNT_AS_HANGING_M` below that contact
+    and not sinking faster than `complete.slip_mps`. The accelerometer shows it if it has measured
+    no fall since the vehicle came within the magnet's reach, and no gap in the telemetry can hide
+    one (`_find_rest_state_from_measured_falls`).
     """
     b, tel = c.belief, c.telemetry
     if (
@@ -152,7 +152,7 @@ def is_still_hanging(c: Context) -> bool:
         if (
             not falls
             and b.vehicle_world_z_at_last_contact_m - tel.position_m[2]
-            <= MAX_HEIGHT_DRIFT_BELOW_CONTACT_IF_HANGING_M
+            <= MAX_DISTANCE_BELOW_CONTACT_TO_COUNT_AS_HANGING_M
         ):
             return True
     return _find_rest_state_from_measured_falls(c) is RestState.HANGS

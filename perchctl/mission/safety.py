@@ -13,7 +13,7 @@ from perchctl.mission.belief.contact import (
     CLIMB_BLOCKED,
     HANGING,
     HANGING_CONFIRMATION_DWELL_S,
-    MIN_SATURATED_TO_FULL_THRUST_RATIO,
+    MIN_FULL_THRUST_FRACTION_TO_COUNT_AS_SATURATED,
     NOT_CLIMBING_AT_FULL_THRUST,
     SLOW_CLIMB_AT_NEARLY_FULL_THRUST,
     Support,
@@ -56,7 +56,7 @@ from perchctl.mission.transition import (
 from perchctl.profile import USED_LATENCY_S
 from perchctl.vehicle import CRASHED, LOCKED, TUMBLED
 
-LIFTOFF_HEIGHT_M = 0.05
+MIN_HEIGHT_TO_COUNT_AS_LIFTED_OFF_M = 0.05
 """Height below which the lateral limit of a take-off is
 `MAX_LATERAL_DISTANCE_FROM_SETPOINT_BEFORE_LIFTOFF_M`, m."""
 MAX_LATERAL_DISTANCE_FROM_SETPOINT_BEFORE_LIFTOFF_M = 0.12
@@ -77,13 +77,13 @@ SETPOINT_DISTANCE_LIMIT_INCREASE_PER_LATENCY_SIGMA_MPS = 4.0
 the camera latency, m per second of its standard deviation, if the target is the position source.
 Pictures that arrive 0.1 s later than assumed displace the vehicle by up to 0.2 m. Larger: a rotated
 camera leads the vehicle further away."""
-MAX_LATERAL_SETPOINT_TO_TAKEOFF_DISTANCE_IN_VERTICAL_CLIMB_M = 0.1
+MAX_LATERAL_SETPOINT_MOVE_TO_COUNT_AS_VERTICAL_CLIMB_M = 0.1
 """Largest lateral distance between setpoint and start in a vertical climb, m."""
 ESTIMATE_CONTRADICTS_IMU_DWELL_S = 0.1
 """Time for which the estimate must contradict the accelerometer, s."""
-MIN_SINK_RATE_IN_OSCILLATION_MPS = 0.5
+MIN_SINK_RATE_TO_COUNT_AS_OSCILLATION_MPS = 0.5
 """Sink rate that only an oscillation of position control reaches, m/s."""
-MIN_CLIMB_RATE_ABOVE_ASCENT_SPEED_IN_OSCILLATION_MPS = 0.35
+MIN_CLIMB_ABOVE_ASCENT_SPEED_TO_COUNT_AS_OSCILLATION_MPS = 0.35
 """If the climb rate exceeds `ascend.speed_mps`, the setpoint's climb rate in an ascent, by more
 than this value, m/s, position control must be oscillating; in flights with prompt positions, the
 difference is 0.1. Larger: the vehicle strikes the target. Smaller: a gust ends the flight."""
@@ -102,10 +102,10 @@ vehicles that can perch reach full thrust for up to 0.4 s. Larger: the vehicle s
 from a greater height. Smaller: a weak vehicle that can perch lands."""
 HELD_BY_OTHER_OBJECT_DWELL_S = 2.0
 """Time that it takes to distinguish the magnet from other supports, s."""
-MAX_VELOCITY_VARIANCE_WITHOUT_SIGHTING_M2PS2 = 0.02
+MAX_VELOCITY_VARIANCE_TO_TRUST_STALE_POSITION_M2PS2 = 0.02
 """Variance of the estimated velocity above which a stale position counts as lost, (m/s)^2; it is
 reached about 3 s after the last sighting."""
-MIN_SIGHTING_TO_ESTIMATE_DISTANCE_IF_ESTIMATE_WRONG_M = 0.3
+MIN_SIGHTING_TO_ESTIMATE_DISTANCE_TO_REJECT_ESTIMATE_M = 0.3
 """Distance of the newest sighting from the estimate beyond which the estimate is wrong, m. Larger:
 position control moves the vehicle further away. Smaller: an oscillation ends the flight."""
 MIN_POSITION_CORRECTION_AGE_TO_TRUST_REJECTED_SIGHTINGS_S = 0.35
@@ -146,7 +146,7 @@ def is_position_control_diverging(c: Context) -> bool:
         if b.is_target_position_source
         else 0.0
     )
-    if phase is Phase.APPROACH and b.height_m < LIFTOFF_HEIGHT_M:
+    if phase is Phase.APPROACH and b.height_m < MIN_HEIGHT_TO_COUNT_AS_LIFTED_OFF_M:
         return (
             _lateral_distance_from_setpoint_m(c)
             > MAX_LATERAL_DISTANCE_FROM_SETPOINT_BEFORE_LIFTOFF_M + spare_m
@@ -154,7 +154,7 @@ def is_position_control_diverging(c: Context) -> bool:
     ground = b.takeoff_position_m
     above_start = ground is not None and (
         math.hypot(setpoint.x_m - ground[0], setpoint.y_m - ground[1])
-        < MAX_LATERAL_SETPOINT_TO_TAKEOFF_DISTANCE_IN_VERTICAL_CLIMB_M
+        < MAX_LATERAL_SETPOINT_MOVE_TO_COUNT_AS_VERTICAL_CLIMB_M
     )
     only_climbs = above_start and phase in (Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE)
     is_pushed = (
@@ -171,11 +171,11 @@ def is_position_control_diverging(c: Context) -> bool:
 def _is_oscillating_vertically(c: Context) -> bool:
     moves = c.state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.HOVER)
     by_capture = c.profile.positioning.source.is_mocap
-    most_mps = c.planner.ascend.speed_mps + MIN_CLIMB_RATE_ABOVE_ASCENT_SPEED_IN_OSCILLATION_MPS
+    most_mps = c.planner.ascend.speed_mps + MIN_CLIMB_ABOVE_ASCENT_SPEED_TO_COUNT_AS_OSCILLATION_MPS
     return (
         moves
         and by_capture
-        and not -MIN_SINK_RATE_IN_OSCILLATION_MPS <= c.belief.climb_mps <= most_mps
+        and not -MIN_SINK_RATE_TO_COUNT_AS_OSCILLATION_MPS <= c.belief.climb_mps <= most_mps
     )
 
 
@@ -221,10 +221,12 @@ def is_position_lost(c: Context) -> bool:
     if (
         b.position_correction_age_s > MIN_POSITION_CORRECTION_AGE_TO_TRUST_REJECTED_SIGHTINGS_S
         and c.obs.rejected_sighting_to_estimate_distance_m
-        > MIN_SIGHTING_TO_ESTIMATE_DISTANCE_IF_ESTIMATE_WRONG_M
+        > MIN_SIGHTING_TO_ESTIMATE_DISTANCE_TO_REJECT_ESTIMATE_M
     ):
         return True
-    unsure = b.max_axis_velocity_variance_m2ps2 > MAX_VELOCITY_VARIANCE_WITHOUT_SIGHTING_M2PS2
+    unsure = (
+        b.max_axis_velocity_variance_m2ps2 > MAX_VELOCITY_VARIANCE_TO_TRUST_STALE_POSITION_M2PS2
+    )
     return b.is_target_position_source and b.is_position_stale and unsure
 
 
@@ -281,7 +283,7 @@ def is_camera_mounting_contradicted(c: Context) -> bool:
     b = c.belief
     below = c.true_for_s(TARGET_BELOW_VEHICLE) >= TARGET_BELOW_VEHICLE_DWELL_S
     return (
-        b.mounting.is_camera_mounting_wrong
+        b.camera_mounting_monitor.is_camera_mounting_wrong
         or b.camera_imu_mismatch.camera_yaw_error_rad != 0.0
         or below
     )
@@ -293,8 +295,10 @@ def wrong_camera_mounting_reason(c: Context) -> str:
     `is_camera_mounting_contradicted` is true, and does not check that again."""
     b = c.belief
     turn_rad = b.camera_imu_mismatch.camera_yaw_error_rad
-    if turn_rad or b.mounting.is_camera_mounting_wrong:
-        turn_deg = 10 * round(math.degrees(turn_rad or b.mounting.camera_yaw_error_rad) / 10.0)
+    if turn_rad or b.camera_mounting_monitor.is_camera_mounting_wrong:
+        turn_deg = 10 * round(
+            math.degrees(turn_rad or b.camera_mounting_monitor.camera_yaw_error_rad) / 10.0
+        )
         turn_deg = 180 if turn_deg == -180 else turn_deg
         text = (
             f"the camera seems to be rotated by about {turn_deg} deg relative to the profile: the "
@@ -358,9 +362,9 @@ def is_thrust_insufficient_to_fly_or_press(c: Context) -> bool:
     - The vehicle has hardly climbed at nearly full thrust for `SLOW_AT_NEARLY_FULL_THRUST_DWELL_S`.
       This does not count in ASCEND, since a weak vehicle that can perch climbs the last part
       slowly.
-    - At the stand-off before a press, hover thrust exceeds `MIN_SATURATED_TO_FULL_THRUST_RATIO`
-      times the largest press thrust. A mission that hovers does not press, so this does not apply
-      to it.
+    - At the stand-off before a press, hover thrust exceeds
+      `MIN_FULL_THRUST_FRACTION_TO_COUNT_AS_SATURATED` times the largest press thrust. A mission
+      that hovers does not press, so this does not apply to it.
 
     Always False while a press is being ended.
     """
@@ -376,8 +380,10 @@ def is_thrust_insufficient_to_fly_or_press(c: Context) -> bool:
         return True
     near = ascends and c.true_for_s(ASCENT_END_HEIGHT_REACHED) >= 0.0
     near = near and c.planner.hover is None
-    return near and c.belief.hover_thrust > MIN_SATURATED_TO_FULL_THRUST_RATIO * max_press_thrust(
-        c.profile
+    return (
+        near
+        and c.belief.hover_thrust
+        > MIN_FULL_THRUST_FRACTION_TO_COUNT_AS_SATURATED * max_press_thrust(c.profile)
     )
 
 
@@ -532,7 +538,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "markers-disagree",
         CAMERA_GUIDED_PHASES,
-        lambda c: c.obs.successive_marker_conflicts >= c.profile.merge.disagreement_frames,
+        lambda c: c.obs.consecutive_marker_conflict_frames >= c.profile.merge.disagreement_frames,
         "the two markers contradict each other: check the printed sizes and the calibration",
     ),
     land_row(

@@ -5,9 +5,12 @@ The firmware flies to a setpoint p with a cascade of PID controllers. On top of 
 perchctl computes p from the reference r, the vehicle's position x (height z), its velocity v, and
 the acceleration a due to its tilt:
 
-    p = r + integral + limit(gain * (LATERAL_ERROR_GAIN (r - x) - LATERAL_DAMPING_S v
-                                     - TILT_ACCELERATION_DAMPING_S2 a))                    lateral
-    p = r + limit(HEIGHT_ERROR_GAIN (r - z) - HEIGHT_DAMPING_S v_z)                        vertical
+    lateral:   p = r + integral
+                   + limit(gain * (LATERAL_ERROR_TO_SETPOINT_CORRECTION_GAIN (r - x)
+                                   - LATERAL_VELOCITY_TO_SETPOINT_DAMPING_GAIN_S v
+                                   - TILT_ACCELERATION_TO_SETPOINT_DAMPING_GAIN_S2 a))
+    vertical:  p = r + limit(HEIGHT_ERROR_TO_SETPOINT_CORRECTION_GAIN (r - z)
+                             - CLIMB_RATE_TO_SETPOINT_DAMPING_GAIN_S v_z)
 
 The integral removes the offset that a steady wind leaves. The lateral correction is state feedback
 on the whole chain from setpoint to position: a setpoint acts through the attitude, so the present
@@ -31,38 +34,38 @@ from perchctl.vehicle import Command, PositionSetpoint
 
 Action = tuple[PlannerState, Command]
 
-HEIGHT_ERROR_GAIN = 1.5
+HEIGHT_ERROR_TO_SETPOINT_CORRECTION_GAIN = 1.5
 """Gain on the height error, to counter the overshoot of the onboard integrator. Larger: the vehicle
 oscillates."""
-HEIGHT_DAMPING_S = 0.25
+CLIMB_RATE_TO_SETPOINT_DAMPING_GAIN_S = 0.25
 """Damping of the height correction by the vertical speed, s. Smaller: the vehicle overshoots."""
-MAX_HEIGHT_CORRECTION_M = 0.15
+MAX_SETPOINT_HEIGHT_CORRECTION_M = 0.15
 """Largest correction of a setpoint's height, m."""
-LATERAL_ERROR_GAIN = 3.0
+LATERAL_ERROR_TO_SETPOINT_CORRECTION_GAIN = 3.0
 """Gain on the lateral error near the target. Larger: late pictures make the vehicle oscillate.
 Smaller: fluctuations of the thrust move the vehicle further."""
-LATERAL_DAMPING_S = 1.1
+LATERAL_VELOCITY_TO_SETPOINT_DAMPING_GAIN_S = 1.1
 """Damping of the lateral correction by the lateral velocity, s. Larger: the noise of the estimated
 velocity moves the vehicle. Smaller: the vehicle oscillates."""
-TILT_ACCELERATION_DAMPING_S2 = 0.13
+TILT_ACCELERATION_TO_SETPOINT_DAMPING_GAIN_S2 = 0.13
 """Damping of the lateral correction by the acceleration due to the vehicle's tilt, s^2. Larger: the
 vehicle responds late to an error. Smaller: the vehicle oscillates with these gains."""
-MAX_TELEMETRY_AGE_FOR_FULL_FEEDBACK_S = 0.06
+MAX_TELEMETRY_AGE_FOR_FULL_LATERAL_FEEDBACK_S = 0.06
 """Age of the telemetry up to which the lateral feedback has its full gain, s. Larger: late
 telemetry makes the vehicle oscillate. Smaller: telemetry at 25 Hz weakens the feedback."""
-MAX_TELEMETRY_AGE_FOR_FEEDBACK_S = 0.16
+MAX_TELEMETRY_AGE_FOR_LATERAL_FEEDBACK_S = 0.16
 """Age of the telemetry at which the gain of the lateral feedback has fallen to zero, s."""
 LATERAL_FEEDBACK_START_DISTANCE_BELOW_TARGET_M = 0.8
 """Distance of the gear below the target at which the lateral feedback starts, m."""
 LATERAL_FEEDBACK_FADE_IN_DISTANCE_M = 0.4
 """Distance over which the lateral feedback grows to its full gain, m."""
-MAX_LATERAL_CORRECTION_M = 0.1
+MAX_LATERAL_SETPOINT_CORRECTION_M = 0.1
 """Largest correction of a setpoint by the lateral feedback, m."""
 MIN_SETPOINT_HEIGHT_ABOVE_GROUND_M = 0.05
 """Lowest height of a setpoint above the ground, m, except in a take-off."""
 MAX_LATERAL_ERROR_TO_INTEGRATE_IN_MOTION_M = 0.06
 """Largest lateral position error that the integral still accumulates while the vehicle moves, m."""
-MAX_LATERAL_INTEGRAL_SHIFT_M = 0.4
+MAX_INTEGRAL_SETPOINT_SHIFT_M = 0.4
 """Largest integral, m; it balances a wind of 5 m/s. Larger: the setpoint of a vehicle that is held
 winds up further. Smaller: a wind keeps the vehicle off its target permanently."""
 MAX_SPEED_TO_COUNT_AS_HOVERING_MPS = 0.1
@@ -123,7 +126,7 @@ def step_setpoint_towards(
         yaw_radps = 0.0
     if (
         limits_speed_until_camera_mounting_confirmed
-        and c.belief.mounting.is_target_motion_undetermined
+        and c.belief.camera_mounting_monitor.is_target_motion_undetermined
     ):
         xy_mps = (
             min(xy_mps, MAX_LATERAL_SPEED_WITH_UNCONFIRMED_CAMERA_MOUNTING_MPS)
@@ -180,7 +183,7 @@ def update_lateral_integral(
     which a steady wind leaves. `dt_s` is the time since the last update.
 
     While the vehicle hovers in place (slower than `MAX_SPEED_TO_COUNT_AS_HOVERING_MPS`), any error
-    is integrated, up to a shift of `MAX_LATERAL_INTEGRAL_SHIFT_M`. While it moves, only errors
+    is integrated, up to a shift of `MAX_INTEGRAL_SETPOINT_SHIFT_M`. While it moves, only errors
     below `MAX_LATERAL_ERROR_TO_INTEGRATE_IN_MOTION_M` are, and the shift does not grow beyond
     `integral_limit_m`.
     """
@@ -190,7 +193,7 @@ def update_lateral_integral(
     tx, ty = c.state.integral_setpoint_shift_world_xy_m
     stands = c.belief.speed_mps < MAX_SPEED_TO_COUNT_AS_HOVERING_MPS
     most_m = (
-        MAX_LATERAL_INTEGRAL_SHIFT_M
+        MAX_INTEGRAL_SETPOINT_SHIFT_M
         if stands
         else max(planner.integral_limit_m, math.hypot(tx, ty))
     )
@@ -218,7 +221,7 @@ def move_setpoint_to_vehicle(c: Context) -> PlannerState:
         c.state,
         setpoint=replace(reference, x_m=x_m, y_m=y_m),
         integral_setpoint_shift_world_xy_m=limit_vector_length(
-            sent.x_m - x_m, sent.y_m - y_m, MAX_LATERAL_INTEGRAL_SHIFT_M
+            sent.x_m - x_m, sent.y_m - y_m, MAX_INTEGRAL_SETPOINT_SHIFT_M
         ),
     )
 
@@ -235,16 +238,16 @@ def correct_setpoint(
     """Return the setpoint to send so that the vehicle reaches `reference` in spite of wind and
     onboard control errors: the reference plus the lateral integral, the lateral feedback
     (`_lateral_feedback_shift_world_xy_m`), and a height correction of at most
-    `MAX_HEIGHT_CORRECTION_M` from the height error and the vertical speed (world axes, m; the
-    module docstring has the equations). If `corrects_height` is False, the height is that of the
-    reference."""
+    `MAX_SETPOINT_HEIGHT_CORRECTION_M` from the height error and the vertical speed (world axes, m;
+    the module docstring has the equations). If `corrects_height` is False, the height is that of
+    the reference."""
     tel = c.telemetry
     rise = (
-        HEIGHT_ERROR_GAIN * (reference.z_m - tel.position_m[2])
-        - HEIGHT_DAMPING_S * tel.velocity_mps[2]
+        HEIGHT_ERROR_TO_SETPOINT_CORRECTION_GAIN * (reference.z_m - tel.position_m[2])
+        - CLIMB_RATE_TO_SETPOINT_DAMPING_GAIN_S * tel.velocity_mps[2]
     )
     lifted = (
-        max(-MAX_HEIGHT_CORRECTION_M, min(MAX_HEIGHT_CORRECTION_M, rise))
+        max(-MAX_SETPOINT_HEIGHT_CORRECTION_M, min(MAX_SETPOINT_HEIGHT_CORRECTION_M, rise))
         if corrects_height
         else 0.0
     )
@@ -266,8 +269,8 @@ def _lateral_feedback_shift_world_xy_m(
     near = (
         LATERAL_FEEDBACK_START_DISTANCE_BELOW_TARGET_M - c.belief.target.gear_to_target_z_m
     ) / LATERAL_FEEDBACK_FADE_IN_DISTANCE_M
-    prompt = (MAX_TELEMETRY_AGE_FOR_FEEDBACK_S - c.belief.attitude_age_s) / (
-        MAX_TELEMETRY_AGE_FOR_FEEDBACK_S - MAX_TELEMETRY_AGE_FOR_FULL_FEEDBACK_S
+    prompt = (MAX_TELEMETRY_AGE_FOR_LATERAL_FEEDBACK_S - c.belief.attitude_age_s) / (
+        MAX_TELEMETRY_AGE_FOR_LATERAL_FEEDBACK_S - MAX_TELEMETRY_AGE_FOR_FULL_LATERAL_FEEDBACK_S
     )
     gain = max(0.0, min(1.0, near, prompt))
     if gain == 0.0:
@@ -275,18 +278,22 @@ def _lateral_feedback_shift_world_xy_m(
     (error_x_m, error_y_m), (vx_mps, vy_mps) = _lateral_error_and_velocity_world_xy(c, reference)
     ax_mps2, ay_mps2 = c.belief.acceleration_from_tilt_world_xy_mps2
     dx = (
-        LATERAL_ERROR_GAIN * error_x_m
-        - LATERAL_DAMPING_S * vx_mps
-        - TILT_ACCELERATION_DAMPING_S2 * ax_mps2
+        LATERAL_ERROR_TO_SETPOINT_CORRECTION_GAIN * error_x_m
+        - LATERAL_VELOCITY_TO_SETPOINT_DAMPING_GAIN_S * vx_mps
+        - TILT_ACCELERATION_TO_SETPOINT_DAMPING_GAIN_S2 * ax_mps2
     )
     dy = (
-        LATERAL_ERROR_GAIN * error_y_m
-        - LATERAL_DAMPING_S * vy_mps
-        - TILT_ACCELERATION_DAMPING_S2 * ay_mps2
+        LATERAL_ERROR_TO_SETPOINT_CORRECTION_GAIN * error_y_m
+        - LATERAL_VELOCITY_TO_SETPOINT_DAMPING_GAIN_S * vy_mps
+        - TILT_ACCELERATION_TO_SETPOINT_DAMPING_GAIN_S2 * ay_mps2
     )
     dx, dy = gain * dx, gain * dy
     size = math.hypot(dx, dy)
-    part = 1.0 if size <= MAX_LATERAL_CORRECTION_M else MAX_LATERAL_CORRECTION_M / size
+    part = (
+        1.0
+        if size <= MAX_LATERAL_SETPOINT_CORRECTION_M
+        else MAX_LATERAL_SETPOINT_CORRECTION_M / size
+    )
     return part * dx, part * dy
 
 

@@ -54,7 +54,7 @@ class DescentState:
 
 
 @dataclass(frozen=True)
-class HoverErrors:
+class HoverErrorAccumulator:
     """Position errors of the gear during a hover, from all frames that measured the target.
 
     An error is the hover position relative to the gear along x (forward), y (left) and z (up), m,
@@ -66,7 +66,12 @@ class HoverErrors:
     hover_began_at_s: float = 0.0  # start of the hover
     newest_frame_at_s: float = 0.0  # time of the newest of these frames
     frame_count: int = 0
-    squared_error_sums_xyz_yaw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    squared_error_sums_level_xyz_m2_yaw_rad2: tuple[float, float, float, float] = (
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+    )
     """Sums of the squared errors in x, y, z, m^2, and yaw, rad^2."""
 
     def with_error(
@@ -74,15 +79,18 @@ class HoverErrors:
         t_s: float,
         gear_to_hover_position_level_m: tuple[float, float, float],
         vehicle_to_target_yaw_rad: float,
-    ) -> HoverErrors:
+    ) -> HoverErrorAccumulator:
         """Return the errors with those of one more frame at `t_s`: the vector from the gear to the
         hover position (forward, left, up) in the level frame, m, and the target's heading relative
         to the vehicle's, rad."""
         errors = (*gear_to_hover_position_level_m, vehicle_to_target_yaw_rad)
         x2, y2, z2, yaw2 = (
-            s + e * e for s, e in zip(self.squared_error_sums_xyz_yaw, errors, strict=True)
+            s + e * e
+            for s, e in zip(self.squared_error_sums_level_xyz_m2_yaw_rad2, errors, strict=True)
         )
-        return HoverErrors(self.hover_began_at_s, t_s, self.frame_count + 1, (x2, y2, z2, yaw2))
+        return HoverErrorAccumulator(
+            self.hover_began_at_s, t_s, self.frame_count + 1, (x2, y2, z2, yaw2)
+        )
 
     @property
     def duration_s(self) -> float:
@@ -90,12 +98,13 @@ class HoverErrors:
         return self.newest_frame_at_s - self.hover_began_at_s
 
     @property
-    def rms_xyz_yaw(self) -> tuple[float, float, float, float]:
+    def rms_level_xyz_m_yaw_rad(self) -> tuple[float, float, float, float]:
         """Root mean squares of the errors in x, y, z, m, and heading, rad; NaN without a frame."""
         if not self.frame_count:
             return math.nan, math.nan, math.nan, math.nan
         x, y, z, yaw = (
-            math.sqrt(each / self.frame_count) for each in self.squared_error_sums_xyz_yaw
+            math.sqrt(each / self.frame_count)
+            for each in self.squared_error_sums_level_xyz_m2_yaw_rad2
         )
         return x, y, z, yaw
 
@@ -112,8 +121,9 @@ class PhaseEntry:
     """
 
     t_s: float = 0.0
-    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # estimated position of the vehicle
-    yaw_rad: float = 0.0
+    # estimated position and heading of the vehicle
+    vehicle_world_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    vehicle_world_yaw_rad: float = 0.0
     transition_name: str = ""  # name of the transition, for logs and displays
     reason: str = "start"
     diagnosis: VehicleDiagnosis = VehicleDiagnosis.NONE  # diagnosis of the transition
@@ -130,10 +140,10 @@ class PlannerState:
     `severity` is that of the last transition, but never falls once it is `LAND` or higher.
     `must_end_press` is True if the phase began with the vehicle pressed at high thrust and the
     press has not ended yet. `integral_setpoint_shift_world_xy_m` is the lateral integral, in world
-    axes, that is added to the setpoint. `catch_setpoint_height_above_vehicle_m` is None unless a
+    axes, that is added to the setpoint. `fall_catch_setpoint_above_vehicle_m` is None unless a
     fall is being caught. `hold_reason` says why the vehicle holds its position, and
-    `waiting_reason` why a row of the transition table keeps the mission in its phase; both are
-    empty otherwise.
+    `wait_in_phase_reason` why a row of the transition table keeps the mission in its phase; both
+    are empty otherwise.
     """
 
     belief: Belief
@@ -154,7 +164,7 @@ class PlannerState:
     integral_setpoint_shift_world_xy_m: tuple[float, float] = (0.0, 0.0)
     #: the phase began with the vehicle pressed at high thrust, and the press has not ended yet
     must_end_press: bool = False
-    catch_setpoint_height_above_vehicle_m: float | None = None
+    fall_catch_setpoint_above_vehicle_m: float | None = None
     """Height of the setpoint above the vehicle during a catch, m; None outside a catch."""
     #: height at which an obstacle blocked the vehicle
     vehicle_world_z_when_blocked_m: float | None = None
@@ -165,10 +175,12 @@ class PlannerState:
     commanded_raw_thrust: int | None = None  #: last commanded raw thrust; None in position mode
     descent: DescentState = DescentState()
     hold_reason: str = ""  #: why the vehicle is holding its position; empty without a hold
-    waiting_reason: str = ""  #: why a row keeps the mission in its phase; empty if none does
+    wait_in_phase_reason: str = ""  #: why a row keeps the mission in its phase; empty if none does
     total_wait_in_phase_s: float = 0.0  #: total waiting time in this phase
     battery: BatteryOutlook = BatteryOutlook()
-    hover_errors: HoverErrors = HoverErrors()  #: position errors in the newest hover
+    hover_errors: HoverErrorAccumulator = (
+        HoverErrorAccumulator()
+    )  #: position errors in the newest hover
 
     @property
     def transition_name(self) -> str:
@@ -184,7 +196,7 @@ class PlannerState:
     def pause_reason(self) -> str:
         """Why the mission is paused: the reason for the hold, or the reason that a row of the
         transition table gives for waiting in the phase. Empty if the mission is not paused."""
-        return self.hold_reason or self.waiting_reason
+        return self.hold_reason or self.wait_in_phase_reason
 
     @property
     def is_before_weight_transfer_and_motor_stop(self) -> bool:
@@ -199,7 +211,7 @@ class PlannerState:
         present phase."""
         return CommandHistory(
             maneuver=maneuver,
-            maneuver_start_position_m=self.entry.position_m,
+            maneuver_start_position_m=self.entry.vehicle_world_position_m,
             setpoint=self.setpoint,
             commanded_raw_thrust=self.commanded_raw_thrust,
             weight_transfer_began_at_s=self.weight_transfer_began_at_s,
@@ -214,7 +226,9 @@ class PlannerState:
         tel, t_s = obs.telemetry, obs.t_s
         return cls(
             belief=Belief.initial_on_ground(obs, profile),
-            entry=PhaseEntry(t_s=t_s, position_m=tel.position_m, yaw_rad=tel.yaw_rad),
+            entry=PhaseEntry(
+                t_s=t_s, vehicle_world_position_m=tel.position_m, vehicle_world_yaw_rad=tel.yaw_rad
+            ),
             flight_started_at_s=t_s,
             t_s=t_s,
             search_step_began_at_s=t_s,

@@ -15,7 +15,7 @@ from perchctl.flight.watchdog import CUT_PERIOD_S
 from perchctl.mission import EventKind, OperatorRequest, Outcome, Phase, RestState, Tick
 from perchctl.mission.descent import (
     MAX_LANDING_COMMAND_COUNT,
-    MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION,
+    MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION_BY_TELEMETRY,
 )
 from perchctl.perception import perception
 from perchctl.profile import Profile
@@ -169,7 +169,7 @@ def test_it_is_bounded() -> None:
     rig.link.motors = False
     rig.rescue(telemetry(0.0))
     assert rig.link.now_s == pytest.approx(PROFILE.planner.landing.timeout_s, abs=0.2)
-    assert len(rig.link.said(Land)) == MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION
+    assert len(rig.link.said(Land)) == MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION_BY_TELEMETRY
 
 
 def test_it_lands_on_the_ground_that_it_started_from_even_without_telemetry() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from perchctl.mission import ImuMotion, Observation, OperatorRequest, Phase, Touchdown
 from perchctl.mission.belief.motion import Impact
-from perchctl.mission.belief.reckoning import DeadReckoning, advance_dead_reckoning
+from perchctl.mission.belief.reckoning import DeadReckoningState, advance_dead_reckoning
 from perchctl.mission.report import MIN_HARD_TOUCHDOWN_SPEED_MPS, find_touchdown
 from perchctl.profile import load_profile
 from perchctl.vehicle import PositionSetpoint, RawThrust, Telemetry
@@ -34,7 +34,7 @@ def dropped(seed: int, share: float, blind: bool) -> tuple[float, Touchdown | No
     vehicle = SimulatedVehicle(scenario)
     link = MockLink(vehicle, profile.link.telemetry_period_s, Radio(scenario.radio_bursts()))
     link.connect()
-    motion, carried, last = ImuMotion(), DeadReckoning(), None
+    motion, carried, last = ImuMotion(), DeadReckoningState(), None
     t_s, dropped_s, hit_s, speed_mps, sink_mps = 1.0, math.inf, math.inf, 0.0, 0.0
     place = (0.0, 0.0, 0.0)
     while t_s < min(9.0, hit_s + 0.6):
@@ -42,7 +42,7 @@ def dropped(seed: int, share: float, blind: bool) -> tuple[float, Touchdown | No
             link.send(PositionSetpoint(place[0], place[1], place[2] + min(0.5, 0.3 * t_s), 0.0))
         else:
             dropped_s = min(dropped_s, t_s)
-            link.send(RawThrust(int(share * motion.mean_hover_thrust)))
+            link.send(RawThrust(int(share * motion.mean_raw_thrust_per_g)))
         for _ in range(10):
             t_s += 0.002
             link.advance_to(t_s)

@@ -11,14 +11,14 @@ import pytest
 
 from perchctl.flight.watchdog import CUT_PERIOD_S, MAX_CUTS, REPEAT_AFTER_S, Watchdog
 from perchctl.mission import Observation, OperatorRequest, Phase, PlannerState
-from perchctl.mission.belief.update import KEEPALIVE_RAW_THRUST
+from perchctl.mission.belief.update import COMMANDED_KEEPALIVE_RAW_THRUST
 from perchctl.mission.descent import (
     LANDING_COMMAND_PERIOD_S,
     MAX_LANDING_COMMAND_COUNT,
-    MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION,
+    MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION_BY_TELEMETRY,
 )
 from perchctl.mission.release import (
-    CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M,
+    FALL_CATCH_SETPOINT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M,
     MOTOR_STOP_COMMAND_COUNT,
 )
 from perchctl.profile import Profile
@@ -45,7 +45,7 @@ LAND_S = PROFILE.safety.loop_late_land_s
 PERIOD_S = 0.02
 T_S = 100.0
 HOVER = PositionSetpoint(0.1, 0.2, 0.9, 0.5)
-RELEASED = RawThrust(KEEPALIVE_RAW_THRUST)
+RELEASED = RawThrust(COMMANDED_KEEPALIVE_RAW_THRUST)
 CEILING_M = 2.0
 AT_CEILING = state_with(
     phase=Phase.COMPLETE,
@@ -184,7 +184,7 @@ def test_a_slip_while_the_loop_is_silent_is_caught_then_landed() -> None:
     rig.after(0.33, **FALLS)
     caught = rig.after(0.35, **FALLS)
     assert caught == PositionSetpoint(
-        0.0, 0.0, min(rig.z_m + CATCH_SETPOINT_HEIGHT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M, 3.0), 0.0
+        0.0, 0.0, min(rig.z_m + FALL_CATCH_SETPOINT_ABOVE_VEHICLE_WITH_MOTORS_OFF_M, 3.0), 0.0
     )
     rig.z_m = CEILING_M - 0.4
     for i in range(6):
@@ -210,10 +210,13 @@ def test_a_silence_of_a_second_lands_and_repeats_until_it_shows() -> None:
     assert rig.after(late_s + 0.05) is None
     active = READY | HL_ACTIVE  # also shown where the notify was lost, and nothing lands
     again_s = LANDING_COMMAND_PERIOD_S + 0.01
-    for i in range(1, MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION):
+    for i in range(1, MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION_BY_TELEMETRY):
         assert isinstance(rig.after(late_s + i * again_s, supervisor=active), Land)
     assert (
-        rig.after(late_s + MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION * again_s, supervisor=active)
+        rig.after(
+            late_s + MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION_BY_TELEMETRY * again_s,
+            supervisor=active,
+        )
         is None
     )
 
@@ -255,7 +258,7 @@ def test_a_landing_of_the_vehicles_own_is_left_alone() -> None:
     landing = remembering(
         IN_AIR,
         phase=Phase.LANDING,
-        stop_or_land_command_count=MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION,
+        stop_or_land_command_count=MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION_BY_TELEMETRY,
         last_stop_or_land_command_at_s=T_S,
     )
     rig = Rig(Idle(), landing)
@@ -309,7 +312,7 @@ def test_what_does_not_peel_off_is_let_go_watched_and_stopped() -> None:
         sent += [command] if command is not None else []
     raw = [c.thrust for c in sent if isinstance(c, RawThrust)]
     assert raw == sorted(raw, reverse=True)
-    assert raw[-1] == KEEPALIVE_RAW_THRUST
+    assert raw[-1] == COMMANDED_KEEPALIVE_RAW_THRUST
     complete = PROFILE.planner.complete
     assert len(raw) * 0.02 == pytest.approx(complete.ramp_s + complete.hang_s, abs=0.2)
     assert sent[-MOTOR_STOP_COMMAND_COUNT:] == [StopMotors()] * MOTOR_STOP_COMMAND_COUNT

@@ -12,7 +12,7 @@ import numpy as np
 
 from perchctl.display.serve import TOKEN_HEADER
 from perchctl.mission import GearToTargetDistance, Observation, Outcome, Phase, Tick
-from perchctl.mission.state import BatteryOutlook, HoverErrors
+from perchctl.mission.state import BatteryOutlook, HoverErrorAccumulator
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers import log as synthetic
 from tests.helpers.mission import HOVERING, state_with
@@ -50,7 +50,7 @@ def tick(
 
 def hover_tick(phase: str = "HOVER", outcome: Outcome | None = None) -> Tick:
     """A moment of a mission that hovers, after two frames: 3 mm ahead, 4 mm low, turned by 0.1."""
-    errors = HoverErrors(100.0)
+    errors = HoverErrorAccumulator(100.0)
     for t_s in (100.5, 101.0):
         errors = errors.with_error(t_s, (0.003, 0.0, 0.004), 0.1)
     told = tick(phase=phase, reason="steady 1.17 m below the target")

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from perchctl.mission import Event, EventKind, ImuMotion, Observation, Phase, PlannerState
-from perchctl.mission.belief.battery import BatteryFit
+from perchctl.mission.belief.battery import BatteryFitState
 from perchctl.mission.belief.belief import Belief
-from perchctl.mission.belief.thrust import HoverThrust
+from perchctl.mission.belief.thrust import HoverThrustEstimate
 from perchctl.mission.context import Context
 from perchctl.mission.observe import update_state_with_observation
 from perchctl.mission.phase import Severity
-from perchctl.mission.state import DescentState, HoverErrors
+from perchctl.mission.state import DescentState, HoverErrorAccumulator
 from perchctl.mission.table import PHASE_TIMED_CONDITIONS, PHASES
 from perchctl.profile import Profile
 from perchctl.vehicle import ARMED, AUTO_ARM, CAN_FLY, FLYING, PositionSetpoint, Telemetry
@@ -26,7 +26,7 @@ READY = AUTO_ARM | CAN_FLY | ARMED
 AIRBORNE = READY | FLYING
 HOVER_THRUST = 56000.0
 CEILING_M = 2.2
-FINE_BATTERY = BatteryFit(
+FINE_BATTERY = BatteryFitState(
     takeoff_rest_v=4.1,
     rest_v=4.08,
     lagged_thrust_fraction=HOVER_THRUST / 65535,
@@ -175,8 +175,8 @@ _BELIEF = {each.name for each in fields(Belief)} - {"t_s"}
 _DESCENT = {each.name for each in fields(DescentState)}
 _ENTRY = {
     "entered_s": "t_s",
-    "entry_m": "position_m",
-    "entry_yaw_rad": "yaw_rad",
+    "entry_m": "vehicle_world_position_m",
+    "entry_yaw_rad": "vehicle_world_yaw_rad",
     "row": "transition_name",
     "reason": "reason",
     "diagnosis": "diagnosis",
@@ -201,7 +201,7 @@ def remembering(state: PlannerState, **changes: Any) -> PlannerState:
     if "hover_thrust" in changes:
         thrust = changes.pop("hover_thrust")
         changes["hover_thrust_estimate"] = (
-            HoverThrust(thrust, LEARNED_SIGMA) if thrust else HoverThrust()
+            HoverThrustEstimate(thrust, LEARNED_SIGMA) if thrust else HoverThrustEstimate()
         )
     belief = {
         name: value
@@ -260,5 +260,5 @@ def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:
         hover_thrust=HOVER_THRUST,
         battery_fit=FINE_BATTERY,
         vehicle_world_z_at_last_contact_m=CEILING_M - 0.03 if phase is Phase.COMPLETE else None,
-        hover_errors=HoverErrors(t_s, t_s),
+        hover_errors=HoverErrorAccumulator(t_s, t_s),
     )

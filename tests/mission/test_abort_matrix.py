@@ -110,7 +110,7 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
     ),
     "loop-late": (_obs(tick_start_delay_s=1.2), 0.1, PRE_LANDING_PHASES, LAND, Outcome.SAFETY),
     "markers-disagree": (
-        _obs(successive_marker_conflicts=40), 0.1, CAMERA_PHASES, LAND, Outcome.SAFETY,
+        _obs(consecutive_marker_conflict_frames=40), 0.1, CAMERA_PHASES, LAND, Outcome.SAFETY,
     ),
     "time-over": (
         lambda o: o, 0.1, PRE_CONTACT_PHASES, LAND, Outcome.ATTEMPTS_USED_UP,
@@ -159,7 +159,7 @@ def _run(state: PlannerState, name: str) -> tuple[PlannerState, list[object]]:
     profile = _profile(state.phase, name)
     commands: list[object] = []
     for t_s in times(lasts_s):
-        obs = event(observation(t_s, state.entry.position_m[2]))
+        obs = event(observation(t_s, state.entry.vehicle_world_position_m[2]))
         state, command = planner.step_mission(state, obs, profile)
         commands.append(command)
         if state.phase in (Phase.LANDING, Phase.ABORTED) and state.transition_name != "":
@@ -187,7 +187,9 @@ def test_every_phase_meets_every_abort(phase: Phase, name: str) -> None:
         by_itself = name in BY_ITSELF and not at_ceiling
         # A heading that jumped is set anew first, so that the firmware does not turn by the jump.
         level = name in LEVEL and name != "heading-lost"
-        down(commands[-1], state.entry.position_m[2], by_itself=by_itself, level=level)
+        down(
+            commands[-1], state.entry.vehicle_world_position_m[2], by_itself=by_itself, level=level
+        )
     assert state.transition_reason
 
 
@@ -244,7 +246,7 @@ def test_an_undisturbed_phase_neither_climbs_nor_stops(phase: Phase) -> None:
     """Only search, ascent, press and take-off climb; motors stop only on proof, and nothing else
     in the table leads to a stop."""
     begin = _begin(phase, "")
-    flight = fly(begin, at(begin.entry.position_m[2]), 6.0, _profile(phase))
+    flight = fly(begin, at(begin.entry.vehicle_world_position_m[2]), 6.0, _profile(phase))
     assert not any(isinstance(c, EmergencyStop | StopMotors) for c in flight.commands)
     climbs = {Phase.SEARCH, Phase.ASCEND, Phase.PERCH, Phase.APPROACH, Phase.COMPLETE}
     start_z = begin.setpoint.z_m if begin.setpoint else 0.0
@@ -397,6 +399,6 @@ def test_unknown_is_not_on_the_ground() -> None:
 def test_an_old_tilt_cuts_no_motor(phase: Phase) -> None:
     """A gust tilts it, and then the telemetry stays away: nothing says that it still is."""
     begin = _begin(phase, "")
-    flight = fly(begin, _heard_last(begin.entry.position_m[2], roll_rad=1.2), 1.6)
+    flight = fly(begin, _heard_last(begin.entry.vehicle_world_position_m[2], roll_rad=1.2), 1.6)
     assert not any(isinstance(c, EmergencyStop | StopMotors) for c in flight.commands)
     assert flight.state.phase is not Phase.ABORTED

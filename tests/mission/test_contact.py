@@ -10,7 +10,7 @@ from perchctl.mission import ImuMotion, Observation, Phase
 from perchctl.mission.belief.contact import (
     CLIMB_BLOCKED,
     IMU_SHOWS_SUPPORT,
-    MIN_PRESS_TO_HOVER_THRUST_RATIO,
+    MIN_REPORTED_TO_HOVER_THRUST_RATIO_TO_DETECT_PRESS,
     TARGET_CONTACT,
     is_pressing_against_surface,
 )
@@ -129,7 +129,7 @@ def test_more_thrust_than_hovering_takes_is_the_same_everywhere(thrust: float) -
         IMU_SHOWS_SUPPORT in b.condition_start_times_s,
         is_pressing_against_surface(b),
     ]
-    assert found == [thrust >= MIN_PRESS_TO_HOVER_THRUST_RATIO] * 4
+    assert found == [thrust >= MIN_REPORTED_TO_HOVER_THRUST_RATIO_TO_DETECT_PRESS] * 4
 
 
 @pytest.mark.parametrize(("commanded_raw_thrust", "presses"), [(60_000, True), (None, False)])

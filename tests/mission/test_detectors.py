@@ -13,12 +13,12 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import ImuMotion
 from perchctl.mission.belief.motion import (
     FALL_DETECTOR_GAINED_CLIMB_RATE_UPPER_CLAMP_MPS,
-    MAX_CLIMB_RATE_GAINED_IF_FALLING_MPS,
-    MAX_STEADY_CLIMB_RATE_DEVIATION_MPS,
-    MAX_STEADY_LATERAL_VELOCITY_DEVIATION_MPS,
+    MAX_CLIMB_RATE_DEVIATION_TO_COUNT_AS_STEADY_MPS,
+    MAX_CLIMB_RATE_GAINED_TO_DETECT_FALL_MPS,
+    MAX_LATERAL_VELOCITY_DEVIATION_TO_COUNT_AS_STEADY_MPS,
     MEAN_LATERAL_VELOCITY_TIME_CONSTANT_S,
-    MIN_FREE_FALL_DURATION_S,
-    MIN_LATERAL_PUSH_G,
+    MIN_LATERAL_SPECIFIC_FORCE_TO_DETECT_PUSH_G,
+    MIN_LOW_G_DURATION_TO_DETECT_FALL_S,
     UP_ACCELERATION_OFFSET_TIME_CONSTANT_S,
     FallDetector,
     FreezeDetector,
@@ -85,7 +85,7 @@ def test_a_fall_is_noticed_after_the_same_time_at_each_rate(part: float) -> None
                 break
     assert len(found) == 3
     assert max(found) - min(found) <= 0.02 + 1e-9  # one sample at the lowest rate
-    assert max(found) <= MIN_FREE_FALL_DURATION_S + 0.04
+    assert max(found) <= MIN_LOW_G_DURATION_TO_DETECT_FALL_S + 0.04
 
 
 @given(RATES_HZ, st.floats(1.0, 6.0))
@@ -113,7 +113,7 @@ def test_a_climb_of_any_speed_delays_the_detection_of_a_fall_only_by_a_little(
     falls_mps2 = part * GRAVITY_MPS2
     # The offset that the detector learns meanwhile, and what it forgets, take a fifth at most.
     late_s = (
-        FALL_DETECTOR_GAINED_CLIMB_RATE_UPPER_CLAMP_MPS - MAX_CLIMB_RATE_GAINED_IF_FALLING_MPS
+        FALL_DETECTOR_GAINED_CLIMB_RATE_UPPER_CLAMP_MPS - MAX_CLIMB_RATE_GAINED_TO_DETECT_FALL_MPS
     ) / (0.8 * falls_mps2)
     flight = [(0.0, 1.0), (5.0, speed_mps / 5.0), (-falls_mps2, late_s + 0.05)]
     assert watched(flight, rate_hz).last_fall_at_s > 1.0
@@ -130,7 +130,11 @@ def test_what_reads_light_for_longer_than_a_rebound_falls_whatever_the_attitude_
         fall = fall.update_fall(t_s, up_acceleration_mps2, reads_g, dt_s)
         if fall.last_fall_at_s > 0.0:
             break
-    assert MIN_FREE_FALL_DURATION_S <= t_s - 1.0 <= MIN_FREE_FALL_DURATION_S + 2.1 * dt_s
+    assert (
+        MIN_LOW_G_DURATION_TO_DETECT_FALL_S
+        <= t_s - 1.0
+        <= MIN_LOW_G_DURATION_TO_DETECT_FALL_S + 2.1 * dt_s
+    )
 
 
 # --- Impacts -------------------------------------------------------------------------------------
@@ -157,7 +161,10 @@ def test_a_harder_blow_is_a_blow_and_never_softer(
     soft, hard = struck(gained_mps, rate_hz), struck(gained_mps + more_mps, rate_hz)
     assert soft.newest_impact.t_s > 0.4
     assert hard.newest_impact.t_s > 0.4
-    assert hard.newest_impact.peak_acc_z_g >= soft.newest_impact.peak_acc_z_g - 1e-9
+    assert (
+        hard.newest_impact.peak_specific_force_body_z_g
+        >= soft.newest_impact.peak_specific_force_body_z_g - 1e-9
+    )
 
 
 @given(RATES_HZ, st.floats(-1.5, -0.3), st.floats(0.3, 1.5))
@@ -165,7 +172,7 @@ def test_the_speed_of_a_touchdown_is_the_one_before_it(
     rate_hz: float, sinks_mps: float, gained_mps: float
 ) -> None:
     blow = struck(gained_mps, rate_hz, sinks_mps).newest_impact
-    assert blow.estimated_climb_before_impact_mps == pytest.approx(sinks_mps, abs=1e-9)
+    assert blow.estimated_climb_rate_before_impact_mps == pytest.approx(sinks_mps, abs=1e-9)
 
 
 @given(RATES_HZ)
@@ -216,16 +223,18 @@ def test_a_constant_speed_is_steady_whatever_it_is(
         speed = speed.update_steady_speed(t_s, velocity, dt_s)
     assert (
         t_s - min(speed.climb_rate_became_steady_at_s, t_s) >= 1.9
-        or abs(climb_mps) <= MAX_STEADY_CLIMB_RATE_DEVIATION_MPS
+        or abs(climb_mps) <= MAX_CLIMB_RATE_DEVIATION_TO_COUNT_AS_STEADY_MPS
     )
     # The first deviation is from a mean that has moved for one sample.
     first_mps = abs(aside_mps) * math.exp(-dt_s / MEAN_LATERAL_VELOCITY_TIME_CONSTANT_S)
     assert (
         t_s - min(speed.lateral_velocity_became_steady_at_s, t_s) >= 1.0
-        or first_mps <= MAX_STEADY_LATERAL_VELOCITY_DEVIATION_MPS + 1e-9
+        or first_mps <= MAX_LATERAL_VELOCITY_DEVIATION_TO_COUNT_AS_STEADY_MPS + 1e-9
     )
     jerked = speed.update_steady_speed(
-        t_s + dt_s, (*velocity[:2], climb_mps + 2.0 * MAX_STEADY_CLIMB_RATE_DEVIATION_MPS), dt_s
+        t_s + dt_s,
+        (*velocity[:2], climb_mps + 2.0 * MAX_CLIMB_RATE_DEVIATION_TO_COUNT_AS_STEADY_MPS),
+        dt_s,
     )
     assert jerked.climb_rate_became_steady_at_s == t_s + dt_s
 
@@ -252,9 +261,11 @@ def pushed(
 def test_a_push_is_one_from_each_side_and_with_each_offset_at_rest(
     rate_hz: float, heading_rad: float, force_g: float, offset_g: float
 ) -> None:
-    assume(abs(force_g - MIN_LATERAL_PUSH_G) > 1e-3)
+    assume(abs(force_g - MIN_LATERAL_SPECIFIC_FORCE_TO_DETECT_PUSH_G) > 1e-3)
     found = pushed(force_g, heading_rad, rate_hz, (offset_g, -offset_g))
-    assert (found.last_lateral_push_at_s > 0.0) is (force_g > MIN_LATERAL_PUSH_G)
+    assert (found.last_lateral_push_at_s > 0.0) is (
+        force_g > MIN_LATERAL_SPECIFIC_FORCE_TO_DETECT_PUSH_G
+    )
 
 
 # --- All of it -----------------------------------------------------------------------------------

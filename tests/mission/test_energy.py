@@ -15,7 +15,7 @@ from perchctl.mission import Outcome, Phase, PlannerState
 from perchctl.mission.belief.battery import (
     BRUSHED_POWER_TRAIN,
     BRUSHLESS_POWER_TRAIN,
-    BatteryFit,
+    BatteryFitState,
     PowerTrain,
     fit_battery_voltage_model,
     update_battery_fit,
@@ -51,7 +51,7 @@ ATTEMPT_S, LANDING_S = 12.0, 10.0
 @dataclass(frozen=True)
 class Moment:
     t_s: float
-    energy: BatteryFit
+    energy: BatteryFitState
     under_load_v: float
 
 
@@ -64,7 +64,7 @@ def hovering(
     mah: float = MAH,
 ) -> Iterator[Moment]:
     """On the ground for 1 s, then hovering, with a press of a second every 8 s."""
-    cell, energy, reading_v = Cell(rest_v, **kind), BatteryFit(), rest_v
+    cell, energy, reading_v = Cell(rest_v, **kind), BatteryFitState(), rest_v
     for i in range(round(most_s / PERIOD_S)):
         t_s = PERIOD_S * i
         load = 0.0 if t_s < 1.0 else 1.0 if t_s % 8.0 > 7.0 else hover
@@ -173,7 +173,9 @@ def test_a_landing_that_has_begun_goes_on_after_low_power(
     assert no_landing_s - landing_s - reserve_s <= time_left_s + 1e-9
 
 
-def used_up(energy: BatteryFit, volts: float, thrust: float, lasts_s: float) -> BatteryFit:
+def used_up(
+    energy: BatteryFitState, volts: float, thrust: float, lasts_s: float
+) -> BatteryFitState:
     """The state after a time under the same reading and thrust."""
     for _ in range(round(lasts_s / PERIOD_S)):
         energy = update_battery_fit(energy, PERIOD_S, volts, thrust, MAH, BRUSHED_POWER_TRAIN)
@@ -182,7 +184,7 @@ def used_up(energy: BatteryFit, volts: float, thrust: float, lasts_s: float) -> 
 
 @pytest.mark.parametrize("reading_v", [0.0, 0.3, math.nan, math.inf, -math.inf, 4.41, 8.38])
 def test_without_a_reading_nothing_is_known(reading_v: float) -> None:
-    energy = used_up(used_up(BatteryFit(), reading_v, 0.0, 1.0), reading_v, HOVER_THRUST, 9.0)
+    energy = used_up(used_up(BatteryFitState(), reading_v, 0.0, 1.0), reading_v, HOVER_THRUST, 9.0)
     assert predict_hover_times(energy, PROFILE, HOVER, BRUSHED_POWER_TRAIN) is None
     assert energy.time_since_battery_reading_s == pytest.approx(10.0)
 
@@ -210,7 +212,7 @@ def test_no_reading_breaks_it(readings: list[tuple[float, float]]) -> None:
 
 
 def flown(
-    phase: Phase, energy: BatteryFit, seconds: float, profile: Profile = PROFILE, **tel: Any
+    phase: Phase, energy: BatteryFitState, seconds: float, profile: Profile = PROFILE, **tel: Any
 ) -> PlannerState:
     begin = remembering(state_in(phase), battery_fit=energy)
     return fly(begin, at(**tel), seconds, profile, one_phase=True).state
@@ -241,15 +243,21 @@ GRACE_S = PROFILE.safety.battery_stale_s
         (Phase.ALIGN, NEAR_ITS_END, 3.24, OPEN, False),
         # Fault 7: a vehicle that tells nothing of its battery is landed after
         # `safety.battery_stale_s`, and not in the middle of an ascent.
-        (Phase.ALIGN, BatteryFit(time_since_battery_reading_s=8.0), 0.0, PROFILE, False),
-        (Phase.ALIGN, BatteryFit(time_since_battery_reading_s=GRACE_S - 10.0), 0.0, PROFILE, True),
+        (Phase.ALIGN, BatteryFitState(time_since_battery_reading_s=8.0), 0.0, PROFILE, False),
+        (
+            Phase.ALIGN,
+            BatteryFitState(time_since_battery_reading_s=GRACE_S - 10.0),
+            0.0,
+            PROFILE,
+            True,
+        ),
         # What was little is no more without a reading.
         (Phase.ALIGN, replace(NEAR_ITS_END, time_since_battery_reading_s=8.0), 0.0, PROFILE, True),
     ],
     ids=["ascends", "presses", "open", "grace", "grace is over", "little before"],
 )
 def test_the_gate_holds_back_only_what_has_too_little_and_has_not_begun(
-    phase: Phase, energy: BatteryFit, battery_v: float, profile: Profile, gated: bool
+    phase: Phase, energy: BatteryFitState, battery_v: float, profile: Profile, gated: bool
 ) -> None:
     lasts_s = 2.0 if phase is Phase.ALIGN else 1.0
     state = flown(phase, energy, lasts_s, profile, battery_v=battery_v)
@@ -272,7 +280,7 @@ def test_a_battery_at_rest_is_known_although_its_reading_stands_still() -> None:
     """Without the resting voltage, a large sag looks like a small charge."""
     for thrust, known_v in ((0.0, 4.12), (HOVER_THRUST, None)):
         obs = replace(at(battery_v=4.12, thrust=thrust)(10.02), battery_reading_age_s=20.0)
-        before = remembering(state_in(Phase.APPROACH), battery_fit=BatteryFit())
+        before = remembering(state_in(Phase.APPROACH), battery_fit=BatteryFitState())
         state = observing(before, obs)
         assert state.belief.battery_fit.takeoff_rest_v == known_v
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 
 from perchctl.mission import CameraFindings, FlightReport, ImuMotion, Observation, Phase
-from perchctl.mission.belief.reckoning import DeadReckoning
+from perchctl.mission.belief.reckoning import DeadReckoningState
 from perchctl.mission.phase import VehicleDiagnosis
 from perchctl.mission.table import TABLE
 from perchctl.profile import CameraConfig
@@ -80,7 +80,7 @@ def test_each_row_that_blames_the_profile_is_known() -> None:
 def test_what_the_magnet_caught_on_its_way_down_has_a_distance_too(phase: Phase) -> None:
     """A contact is proven only in PERCH; what hangs after a landing was carried there by the dead
     reckoning."""
-    dead_reckoning = DeadReckoning(
+    dead_reckoning = DeadReckoningState(
         imu_at_last_update=ImuMotion(t_s=BEGIN_S),
         gear_to_target_world_xy_m=(0.03, 0.04),
         gear_to_target_sigma_m=0.01,
@@ -99,7 +99,7 @@ def test_what_the_magnet_caught_on_its_way_down_has_a_distance_too(phase: Phase)
 
 def test_what_hangs_with_its_motors_off_stays_where_it_was_caught() -> None:
     """Its distance does not become unsure while it hangs there."""
-    dead_reckoning = DeadReckoning(
+    dead_reckoning = DeadReckoningState(
         gear_to_target_world_xy_m=(0.02, 0.0),
         gear_to_target_sigma_m=0.01,
         gear_below_target_m=0.0,

@@ -12,19 +12,19 @@ from hypothesis import strategies as st
 
 from perchctl.mission.belief.belief import Belief
 from perchctl.mission.belief.hover import (
-    HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_DESCENT,
+    HOVER_THRUST_RANDOM_WALK_FRACTION_PER_SQRT_S_IN_DESCENT,
     MAX_HOVER_THRUST_CORRECTION_IN_DESCENT_SIGMAS,
-    MIN_HOVER_THRUST_SIGMA_FRACTION_IN_DESCENT,
+    MIN_HOVER_THRUST_SIGMA_FRACTION_AT_DESCENT_START,
     estimate_hover_thrust,
     learn_hover_thrust_in_descent,
     learn_hover_thrust_in_quiet_flight,
 )
 from perchctl.mission.belief.maneuver import CommandHistory, Maneuver
 from perchctl.mission.belief.thrust import (
-    HOVER_THRUST_BY_ACCELEROMETER_SIGMA_FRACTION,
-    HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_QUIET_FLIGHT,
-    ONE_SECOND_MEAN_HOVER_THRUST_SIGMA_FRACTION,
-    HoverThrust,
+    HOVER_THRUST_RANDOM_WALK_FRACTION_PER_SQRT_S_IN_QUIET_FLIGHT,
+    INITIAL_HOVER_THRUST_SIGMA_FRACTION_FROM_ACCELEROMETER,
+    ONE_SECOND_HOVER_THRUST_MEASUREMENT_SIGMA_FRACTION,
+    HoverThrustEstimate,
 )
 from perchctl.mission.phase import Phase
 from perchctl.values import replace
@@ -40,8 +40,8 @@ from tests.helpers.mission import (
 thrusts = st.floats(30_000.0, 62_000.0)
 drifts = st.sampled_from(
     [
-        HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_QUIET_FLIGHT,
-        HOVER_THRUST_DRIFT_FRACTION_PER_SQRT_S_IN_DESCENT,
+        HOVER_THRUST_RANDOM_WALK_FRACTION_PER_SQRT_S_IN_QUIET_FLIGHT,
+        HOVER_THRUST_RANDOM_WALK_FRACTION_PER_SQRT_S_IN_DESCENT,
     ]
 )
 DESCENDS = CommandHistory(maneuver=Maneuver(descends_to_floor=True), commanded_raw_thrust=48_000)
@@ -54,7 +54,9 @@ def believing(phase: Phase, thrust: float, acc_z_g: float = 1.0) -> Belief:
     return context_at(state, observation(10.0, telemetry=sample)).belief
 
 
-def measured(start: HoverThrust, values: Iterable[float], dt_s: float, drift: float) -> HoverThrust:
+def measured(
+    start: HoverThrustEstimate, values: Iterable[float], dt_s: float, drift: float
+) -> HoverThrustEstimate:
     for value in values:
         start = start.propagate(dt_s, drift).with_measurement(value, dt_s)
     return start
@@ -63,50 +65,52 @@ def measured(start: HoverThrust, values: Iterable[float], dt_s: float, drift: fl
 @given(first=thrusts, true=thrusts, drift=drifts)
 def test_it_converges_to_what_is_measured(first: float, true: float, drift: float) -> None:
     settled_s = (
-        12.0 * ONE_SECOND_MEAN_HOVER_THRUST_SIGMA_FRACTION / drift
+        12.0 * ONE_SECOND_HOVER_THRUST_MEASUREMENT_SIGMA_FRACTION / drift
     )  # the filter's own time, twelve times
     steps = int(settled_s / 0.02)
     found = measured(
-        HoverThrust(first, HOVER_THRUST_BY_ACCELEROMETER_SIGMA_FRACTION),
+        HoverThrustEstimate(first, INITIAL_HOVER_THRUST_SIGMA_FRACTION_FROM_ACCELEROMETER),
         [true] * steps,
         0.02,
         drift,
     )
-    assert found.thrust == pytest.approx(true, rel=1e-3)
+    assert found.raw_thrust == pytest.approx(true, rel=1e-3)
 
 
 @given(sigma=st.floats(1e-3, 0.2), drift=drifts)
 def test_its_spread_settles_where_drift_and_noise_balance(sigma: float, drift: float) -> None:
     """P = r d for a scalar Kalman filter, within the step of a tick."""
-    found = measured(HoverThrust(50_000.0, sigma), [50_000.0] * 3000, 0.02, drift)
+    found = measured(HoverThrustEstimate(50_000.0, sigma), [50_000.0] * 3000, 0.02, drift)
     assert found.sigma_fraction == pytest.approx(
-        math.sqrt(ONE_SECOND_MEAN_HOVER_THRUST_SIGMA_FRACTION * drift), rel=0.05
+        math.sqrt(ONE_SECOND_HOVER_THRUST_MEASUREMENT_SIGMA_FRACTION * drift), rel=0.05
     )
 
 
 @given(first=thrusts, true=thrusts, drift=drifts)
 def test_the_rate_of_the_loop_changes_nothing(first: float, true: float, drift: float) -> None:
     """Half as many measurements that stand for twice the time; 2 % of the step that is measured."""
-    start = HoverThrust(first, HOVER_THRUST_BY_ACCELEROMETER_SIGMA_FRACTION)
+    start = HoverThrustEstimate(first, INITIAL_HOVER_THRUST_SIGMA_FRACTION_FROM_ACCELEROMETER)
     slow = measured(start, [true] * 25, 0.02, drift)
     fast = measured(start, [true] * 50, 0.01, drift)
-    assert slow.thrust == pytest.approx(fast.thrust, abs=0.02 * abs(true - first) + 1e-6)
+    assert slow.raw_thrust == pytest.approx(fast.raw_thrust, abs=0.02 * abs(true - first) + 1e-6)
     assert slow.sigma_fraction == pytest.approx(fast.sigma_fraction, rel=0.05)
 
 
 @given(old=thrusts, one=thrusts, other=thrusts, sigma=st.floats(1e-3, 0.2))
 def test_more_measured_is_more_believed(old: float, one: float, other: float, sigma: float) -> None:
-    start = HoverThrust(old, sigma)
-    low, high = (start.with_measurement(each, 0.02).thrust for each in sorted((one, other)))
+    start = HoverThrustEstimate(old, sigma)
+    low, high = (start.with_measurement(each, 0.02).raw_thrust for each in sorted((one, other)))
     assert low <= high
-    assert min(old, one) - 1e-6 <= start.with_measurement(one, 0.02).thrust <= max(old, one) + 1e-6
+    assert (
+        min(old, one) - 1e-6 <= start.with_measurement(one, 0.02).raw_thrust <= max(old, one) + 1e-6
+    )
     assert start.with_measurement(one, 0.0) == start  # no time, no evidence
 
 
 @pytest.mark.parametrize(("thrust", "learns"), [(52_000.0, True), (62_000.0, False)])
 def test_a_hand_that_holds_the_vehicle_teaches_nothing(thrust: float, learns: bool) -> None:
     found = learn_hover_thrust_in_quiet_flight(believing(Phase.ALIGN, thrust), 0.02)
-    assert (found.thrust > 50_000.0) is learns
+    assert (found.raw_thrust > 50_000.0) is learns
 
 
 @given(thrust=thrusts, acc_z_g=st.floats(0.7, 1.3))
@@ -119,7 +123,7 @@ def test_a_descent_stays_within_the_spread_that_it_began_with(
     assert (
         abs(b.hover_thrust / 50_000.0 - 1.0)
         <= MAX_HOVER_THRUST_CORRECTION_IN_DESCENT_SIGMAS
-        * MIN_HOVER_THRUST_SIGMA_FRACTION_IN_DESCENT
+        * MIN_HOVER_THRUST_SIGMA_FRACTION_AT_DESCENT_START
         + 1e-9
     )
     assert (b.hover_thrust > 50_000.0) is (thrust / acc_z_g > 50_000.0)
@@ -137,14 +141,15 @@ def test_a_descent_stays_within_the_spread_that_it_began_with(
 def test_what_may_carry_it_teaches_a_descent_nothing(hides: dict[str, Any]) -> None:
     b = believing(Phase.LANDING, 30_000.0)
     assert (
-        learn_hover_thrust_in_descent(replace(b, command_history=DESCENDS), 0.02).thrust < 50_000.0
+        learn_hover_thrust_in_descent(replace(b, command_history=DESCENDS), 0.02).raw_thrust
+        < 50_000.0
     )
-    assert learn_hover_thrust_in_descent(replace(b, **hides), 0.02).thrust == 50_000.0
+    assert learn_hover_thrust_in_descent(replace(b, **hides), 0.02).raw_thrust == 50_000.0
 
 
 def test_what_was_never_learned_is_felt_and_rough() -> None:
-    b = replace(believing(Phase.LANDING, 45_000.0), hover_thrust_estimate=HoverThrust())
-    assert estimate_hover_thrust(b).thrust == pytest.approx(45_000.0)
+    b = replace(believing(Phase.LANDING, 45_000.0), hover_thrust_estimate=HoverThrustEstimate())
+    assert estimate_hover_thrust(b).raw_thrust == pytest.approx(45_000.0)
     assert estimate_hover_thrust(b).is_imprecise
     assert not learn_hover_thrust_in_quiet_flight(b, 0.02).is_imprecise
 
@@ -154,7 +159,7 @@ def test_a_sample_is_measured_once_however_often_the_loop_sees_it() -> None:
     start = remembering(
         state_in(Phase.LANDING),
         commanded_raw_thrust=45_000,
-        hover_thrust_estimate=HoverThrust(50_000.0, 0.12),
+        hover_thrust_estimate=HoverThrustEstimate(50_000.0, 0.12),
     )
     sample = replace(telemetry(10.02, 1.0), thrust=45_000.0)
     once = observing(start, observation(10.02, telemetry=sample))
@@ -167,7 +172,9 @@ def test_a_sample_is_measured_once_however_often_the_loop_sees_it() -> None:
 def test_a_step_of_the_thrust_is_no_other_hover_thrust(step: float) -> None:
     """The rotors follow an order with their lag, and the accelerometer with them: until they have,
     the thrust that is read divided by the specific force is not what hovering takes."""
-    state = remembering(state_in(Phase.LANDING), hover_thrust_estimate=HoverThrust(50_000.0, 0.12))
+    state = remembering(
+        state_in(Phase.LANDING), hover_thrust_estimate=HoverThrustEstimate(50_000.0, 0.12)
+    )
     force_g = 1.0
     for i in range(100):
         t_s, read = 10.0 + 0.01 * i, 50_000.0 if i < 50 else step * 50_000.0
@@ -181,13 +188,17 @@ def test_a_step_of_the_thrust_is_no_other_hover_thrust(step: float) -> None:
 
 @given(sigma=st.floats(1e-3, 0.2), dt_s=st.floats(0.0, 600.0))
 def test_what_is_not_measured_grows_unsure_up_to_what_is_felt(sigma: float, dt_s: float) -> None:
-    later = HoverThrust(50_000.0, sigma).propagate_with_bounded_sigma(dt_s)
-    assert sigma <= later.sigma_fraction <= max(sigma, HOVER_THRUST_BY_ACCELEROMETER_SIGMA_FRACTION)
+    later = HoverThrustEstimate(50_000.0, sigma).propagate_with_bounded_sigma(dt_s)
+    assert (
+        sigma
+        <= later.sigma_fraction
+        <= max(sigma, INITIAL_HOVER_THRUST_SIGMA_FRACTION_FROM_ACCELEROMETER)
+    )
 
 
 def test_an_unknown_thrust_is_the_first_one_that_is_measured() -> None:
-    found = HoverThrust().with_measurement(48_000.0, 0.02)
-    assert found.thrust == 48_000.0
+    found = HoverThrustEstimate().with_measurement(48_000.0, 0.02)
+    assert found.raw_thrust == 48_000.0
     assert math.isfinite(found.sigma_fraction)
 
 

@@ -12,10 +12,10 @@ import pytest
 from perchctl.mission import Outcome, Phase
 from perchctl.mission.phases.hover import (
     MAX_HEIGHT_RETURN_DURATION_TO_KEEP_HOVER_TIMER_S,
-    MAX_SINK_BELOW_HOVER_HEIGHT_M,
+    MAX_SINK_BELOW_HOVER_HEIGHT_BEFORE_CLIMB_BACK_M,
 )
 from perchctl.mission.report import HoverReport
-from perchctl.mission.state import HoverErrors
+from perchctl.mission.state import HoverErrorAccumulator
 from perchctl.profile import Profile
 from perchctl.vehicle import LOCKED, PositionSetpoint
 from tests.helpers.mission import (
@@ -55,7 +55,7 @@ def test_it_sinks_below_a_nearer_target_and_never_follows_one_that_is_farther(
 
 def sunk_for(low_s: float) -> Look:
     """The vehicle is 8 cm too low for that time, and then at its place."""
-    low, there = at(1.0 - MAX_SINK_BELOW_HOVER_HEIGHT_M - 0.02), at()
+    low, there = at(1.0 - MAX_SINK_BELOW_HOVER_HEIGHT_BEFORE_CLIMB_BACK_M - 0.02), at()
     return lambda t_s: (low if t_s < BEGIN_S + low_s else there)(t_s)
 
 
@@ -91,7 +91,9 @@ def test_a_hover_is_completed_only_while_the_target_is_seen() -> None:
     remembered = target_at(
         BEGIN_S, is_measured_in_newest_frame=False, tracked=False, last_measured_at_s=BEGIN_S - 1.0
     )
-    late = remembering(state_in(Phase.HOVER), hover_errors=HoverErrors(BEGIN_S - DURATION_S - 1.0))
+    late = remembering(
+        state_in(Phase.HOVER), hover_errors=HoverErrorAccumulator(BEGIN_S - DURATION_S - 1.0)
+    )
     assert fly(late, at(obs={"target": remembered}), 0.1, HOVERING).state.phase is Phase.HOVER
     assert fly(late, at(), 0.1, HOVERING).state.outcome is Outcome.HOVERED
 
@@ -168,7 +170,7 @@ def test_each_frame_counts_once_and_the_errors_are_those_of_the_place() -> None:
     assert report.duration_s == pytest.approx(4 * TICK_S)
     assert "RMS error x 30.0, y 0.0, z 40.0 mm, heading 5.7 deg" in report.text
     assert HoverReport.from_state(state, PROFILE) is None
-    assert all(math.isnan(each) for each in HoverErrors().rms_xyz_yaw)
+    assert all(math.isnan(each) for each in HoverErrorAccumulator().rms_level_xyz_m_yaw_rad)
 
 
 def hovers_at(below_m: float, **safety: float) -> Profile:

@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 
 from perchctl.mission import ImuMotion
 from perchctl.mission.belief.motion import (
-    MAX_FROZEN_READING_DURATION_S,
-    MAX_TELEMETRY_GAP_S,
-    MIN_LATERAL_PUSH_G,
-    NO_FUSION_TIMEOUT_S,
+    MAX_FROZEN_READING_DURATION_TO_TRUST_SAMPLE_S,
+    MAX_SAMPLE_INTERVAL_WITHOUT_TELEMETRY_GAP_S,
+    MIN_LATERAL_SPECIFIC_FORCE_TO_DETECT_PUSH_G,
+    MIN_VARIANCE_GROWTH_TIME_TO_DETECT_FUSION_STOP_S,
 )
 from perchctl.mission.belief.reckoning import (
     MAGNET_REACH_BELOW_TARGET_M,
-    MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS,
-    DeadReckoning,
+    MAX_POSSIBLE_CLIMB_RATE_IN_TELEMETRY_GAP_MPS,
+    DeadReckoningState,
     advance_dead_reckoning,
     restart_dead_reckoning_at_sighting,
 )
@@ -44,7 +44,7 @@ def test_an_accelerometer_that_stands_still_is_a_silence() -> None:
     assert motion.last_fall_at_s < 0.0
     assert (
         abs(motion.velocity_since_first_sample_world_mps[2])
-        < 1.1 * 0.1 * 9.81 * MAX_FROZEN_READING_DURATION_S
+        < 1.1 * 0.1 * 9.81 * MAX_FROZEN_READING_DURATION_TO_TRUST_SAMPLE_S
     )
     alive = flown([telemetry(0.01 * i, acc_z_g=0.9) for i in range(300)])
     assert alive.acceleration_frozen_for_s == 0.0
@@ -60,7 +60,10 @@ def since_heard(after: Telemetry, before: Telemetry | None = None) -> ImuMotion:
     return UNTIL_THEN.with_sample(before or HUNG[-1], after)
 
 
-@given(silent_s=st.floats(MAX_TELEMETRY_GAP_S + 0.01, 4.0), drift_mps=st.floats(-0.1, 0.1))
+@given(
+    silent_s=st.floats(MAX_SAMPLE_INTERVAL_WITHOUT_TELEMETRY_GAP_S + 0.01, 4.0),
+    drift_mps=st.floats(-0.1, 0.1),
+)
 def test_a_silence_over_which_the_estimate_shows_no_fall_hides_none(
     silent_s: float, drift_mps: float
 ) -> None:
@@ -90,7 +93,7 @@ def test_after_a_silence_the_estimate_s_own_change_counts() -> None:
     before = telemetry(1.0, velocity_mps=(0.1, 0.0, 0.15))
     after = telemetry(1.7, velocity_mps=(0.1, 0.2, -0.5))
     imu = flown([before])
-    old = DeadReckoning(
+    old = DeadReckoningState(
         imu, velocity_world_mps=(0.0, 0.0, 0.05), estimated_velocity_world_mps=before.velocity_mps
     )
     heard = imu.with_sample(before, after)
@@ -131,15 +134,16 @@ def test_a_correction_by_a_wrong_position_does_not_turn_what_is_felt(
         return samples
 
     misled, true = flown(flight(True)), flown(flight(False))
-    assert true.roll_pitch_error_rad == (0.0, 0.0)
-    assert misled.roll_pitch_error_rad == pytest.approx(step_rad, rel=0.06, abs=0.001)
+    assert true.error_of_estimated_roll_pitch_rad == (0.0, 0.0)
+    assert misled.error_of_estimated_roll_pitch_rad == pytest.approx(step_rad, rel=0.06, abs=0.001)
     assert misled.velocity_since_first_sample_world_mps[:2] == pytest.approx(
         true.velocity_since_first_sample_world_mps[:2], abs=0.04
     )
 
 
 @given(
-    gear_below_target_m=st.floats(0.05, 2.0), silent_s=st.floats(MAX_TELEMETRY_GAP_S + 0.01, 3.0)
+    gear_below_target_m=st.floats(0.05, 2.0),
+    silent_s=st.floats(MAX_SAMPLE_INTERVAL_WITHOUT_TELEMETRY_GAP_S + 0.01, 3.0),
 )
 def test_in_a_silence_only_what_had_thrust_climbs_into_the_magnet_s_reach(
     gear_below_target_m: float, silent_s: float
@@ -148,7 +152,7 @@ def test_in_a_silence_only_what_had_thrust_climbs_into_the_magnet_s_reach(
     hangs where it hung."""
     sinks = {"velocity_mps": (0.0, 0.0, -0.3)}
     near = (
-        gear_below_target_m - MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS * silent_s
+        gear_below_target_m - MAX_POSSIBLE_CLIMB_RATE_IN_TELEMETRY_GAP_MPS * silent_s
         < MAGNET_REACH_BELOW_TARGET_M
     )
     off = {"thrust": 0.0}
@@ -177,7 +181,9 @@ def test_in_a_silence_only_what_had_thrust_climbs_into_the_magnet_s_reach(
         (0.02, telemetry(1.0, **off), telemetry(1.0 + silent_s, **off), True, True),
     ):
         imu = flown([before])
-        old = restart_dead_reckoning_at_sighting(DeadReckoning(imu), 0.9, (0.0, 0.0), z_m, 0.001)
+        old = restart_dead_reckoning_at_sighting(
+            DeadReckoningState(imu), 0.9, (0.0, 0.0), z_m, 0.001
+        )
         new = advance_dead_reckoning(
             old, imu.with_sample(before, after), after, is_estimate_trusted=False
         )
@@ -196,7 +202,7 @@ def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring
     falls = [telemetry(1.0 + 0.01 * i, acc_z_g=0.3) for i in range(13)]
     motion = flown(falls[:1])
     dead_reckoning = restart_dead_reckoning_at_sighting(
-        DeadReckoning(motion), 0.9, (0.0, 0.0), 0.0, 0.001
+        DeadReckoningState(motion), 0.9, (0.0, 0.0), 0.0, 0.001
     )
     late = telemetry(falls[-1].t_s + 1.5)
     for last, new in pairwise([*falls, late]):
@@ -217,7 +223,7 @@ def estimate_only_mps(
     many samples show. `offset_g`: what the accelerometer reads too much."""
     lean_rad = 1.0 / 9.81
     dead_reckoning, motion, last = (
-        DeadReckoning(),
+        DeadReckoningState(),
         ImuMotion(accelerometer_offset_g=(offset_g, 0.0, 0.0)),
         None,
     )
@@ -238,9 +244,9 @@ def estimate_only_mps(
 def test_an_estimate_that_moves_otherwise_than_it_feels_is_told_from_one_that_was_pushed() -> None:
     assert estimate_only_mps(1) < 0.05
     assert estimate_only_mps(-1) > 0.3
-    assert estimate_only_mps(-1, pushed_g=2.0 * MIN_LATERAL_PUSH_G) == 0.0
+    assert estimate_only_mps(-1, pushed_g=2.0 * MIN_LATERAL_SPECIFIC_FORCE_TO_DETECT_PUSH_G) == 0.0
     assert estimate_only_mps(-1, pushed_g=0.09, samples=20) == 0.0  # a gust of 1 m/s in a second
-    assert estimate_only_mps(-1, offset_g=1.2 * MIN_LATERAL_PUSH_G) > 0.3
+    assert estimate_only_mps(-1, offset_g=1.2 * MIN_LATERAL_SPECIFIC_FORCE_TO_DETECT_PUSH_G) > 0.3
 
 
 # --- Whether the estimate is corrected -----------------------------------------------------------
@@ -258,12 +264,14 @@ def uncorrected_s(*growths: tuple[float, float]) -> float:
                 variance += 0.1 * per_s
             new = telemetry(t_s, climb_variance_m2ps2=variance)
             motion, last = motion.with_sample(last, new), new
-    return motion.fusion_age.age_s(t_s)
+    return motion.estimate_fusion_monitor.age_s(t_s)
 
 
 def test_a_variance_that_grows_on_and_on_is_corrected_no_more() -> None:
     """After 0.5 s it is certain, and then the age counts from the last correction."""
-    assert uncorrected_s((0.0, 1.0), (1e-3, NO_FUSION_TIMEOUT_S)) == 0.0
+    assert (
+        uncorrected_s((0.0, 1.0), (1e-3, MIN_VARIANCE_GROWTH_TIME_TO_DETECT_FUSION_STOP_S)) == 0.0
+    )
     assert uncorrected_s((0.0, 1.0), (1e-3, 0.6)) == pytest.approx(0.6, abs=0.11)
     assert uncorrected_s((0.0, 1.0), (1e-3, 5.0)) == pytest.approx(5.0, abs=0.11)
 
@@ -283,4 +291,4 @@ def test_what_is_corrected_or_not_known_is_not_called_uncorrected(
 
 def test_no_silence_and_no_frozen_accelerometer_hides_that_nothing_corrects_it() -> None:
     silent = [telemetry(0.3 * i, climb_variance_m2ps2=1e-4 + 3e-4 * i) for i in range(10)]
-    assert flown(silent).fusion_age.age_s(2.7) == pytest.approx(2.7)
+    assert flown(silent).estimate_fusion_monitor.age_s(2.7) == pytest.approx(2.7)

@@ -26,10 +26,13 @@ from perchctl.mission import (
     rest,
 )
 from perchctl.mission.belief.contact import IMU_SHOWS_SUPPORT, MOTORS_OFF_AS_COMMANDED
-from perchctl.mission.belief.motion import FusionAge
-from perchctl.mission.belief.mounting import MIN_CONTRADICTING_SIGHTINGS, CameraMountingMonitor
+from perchctl.mission.belief.motion import EstimateFusionMonitor
+from perchctl.mission.belief.mounting import (
+    MIN_CONTRADICTING_SIGHTINGS_TO_JUDGE_MOUNTING_WRONG,
+    CameraMountingMonitor,
+)
 from perchctl.mission.belief.quality import BATTERY_LOW
-from perchctl.mission.belief.reckoning import DeadReckoning
+from perchctl.mission.belief.reckoning import DeadReckoningState
 from perchctl.mission.context import Context
 from perchctl.mission.descent import PEEL_OFF_MAGNET_TIMEOUT_S
 from perchctl.mission.phase import PRE_LANDING_PHASES, VehicleDiagnosis
@@ -127,7 +130,7 @@ def context(
         t_s=NOW_S - TICK_S, last_telemetry=sample, dead_reckoned_height_m=z_m,
         vehicle_world_z_at_last_contact_m=z_m if held else None,
         magnet_reach_entered_at_s=NOW_S - 2.0 if held else None,
-        dead_reckoning=DeadReckoning(imu_at_last_update=ImuMotion(t_s=sample.t_s)),
+        dead_reckoning=DeadReckoningState(imu_at_last_update=ImuMotion(t_s=sample.t_s)),
     )  # fmt: skip
     state = remembering(state, **{**remembered, **changes})
     obs = observation(NOW_S, telemetry=replace(sample, **(tel or {})), target=None, **observed)
@@ -292,7 +295,11 @@ def test_a_heading_is_not_set_anew_where_that_would_lift_the_vehicle_or_is_no_nu
 
 def uncorrected(for_s: float) -> dict[str, Any]:
     """A deck that has given no positions for so long."""
-    return {"imu": ImuMotion(t_s=NOW_S, fusion_age=FusionAge(1e-3, NOW_S, NOW_S - for_s))}
+    return {
+        "imu": ImuMotion(
+            t_s=NOW_S, estimate_fusion_monitor=EstimateFusionMonitor(1e-3, NOW_S, NOW_S - for_s)
+        )
+    }
 
 
 @pytest.mark.parametrize(
@@ -322,7 +329,9 @@ def test_a_mounting_that_seems_turned_may_be_the_capture_s_axes(
     """By such positions a landing would speed up until it tilts over."""
     begin = remembering(
         state_in(Phase.ALIGN, NOW_S),
-        mounting=CameraMountingMonitor(contradicting_sighting_count=MIN_CONTRADICTING_SIGHTINGS),
+        camera_mounting_monitor=CameraMountingMonitor(
+            contradicting_sighting_count=MIN_CONTRADICTING_SIGHTINGS_TO_JUDGE_MOUNTING_WRONG
+        ),
     )
     obs = observation(NOW_S + TICK_S)
     state, command = planner.step_mission(begin, obs, PROFILES[positioning])
@@ -429,7 +438,7 @@ def test_a_floor_that_was_felt_is_one_unless_it_falls_with_its_thrust(
 ) -> None:
     """On half of the hover thrust: in the air the accelerometer reads half a g."""
     half = 0.5 * HOVER_THRUST
-    aside = DeadReckoning(
+    aside = DeadReckoningState(
         imu_at_last_update=ImuMotion(t_s=NOW_S - 0.01), velocity_world_mps=(0.8, 0.0, 0.0)
     )
     c = context(
@@ -446,7 +455,9 @@ def test_a_floor_that_was_felt_is_one_unless_it_falls_with_its_thrust(
 def test_a_blow_from_below_is_the_floor_s_only_if_it_sank(impact_mps: float, floor: bool) -> None:
     """A vehicle that climbs, just after the lift-off, has not met the floor."""
     imu = ImuMotion(t_s=NOW_S - 0.01, last_impact_or_bounce_at_s=NOW_S - 0.05)
-    struck = DeadReckoning(imu_at_last_update=imu, climb_before_impact_mps=impact_mps)
+    struck = DeadReckoningState(
+        imu_at_last_update=imu, climb_rate_before_newest_impact_mps=impact_mps
+    )
     c = context("imu", z_m=0.15, dead_reckoning=struck)
     c = Context(
         replace(c.state, belief=c.belief.with_observation(replace(c.obs, imu=imu), c.profile))
@@ -483,7 +494,7 @@ def test_level_is_against_the_wind_and_the_error_of_the_attitude(
     acceleration_bias_mps2 = 9.81 * wrong_rad
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
     imu, reads_mps2 = ImuMotion(t_s=NOW_S - 0.01), 9.81 * wind_g
-    dead_reckoning = DeadReckoning(
+    dead_reckoning = DeadReckoningState(
         imu_at_last_update=imu,
         acceleration_bias_world_mps2=(
             acceleration_bias_mps2 * cos,
@@ -508,7 +519,9 @@ def test_level_is_against_the_wind_and_the_error_of_the_attitude(
 
 
 def test_the_felt_speed_is_braked_whatever_the_estimate_says() -> None:
-    c = context("imu", dead_reckoning=DeadReckoning(imu_at_last_update=ImuMotion(t_s=NOW_S - 0.03)))
+    c = context(
+        "imu", dead_reckoning=DeadReckoningState(imu_at_last_update=ImuMotion(t_s=NOW_S - 0.03))
+    )
     motion = VisualInertialMotion(NOW_S - 0.01, (0.3, 0.0), (0.0, 0.0), 0.0)
     obs = replace(c.obs, visual_inertial_motion=motion, imu=replace(c.obs.imu, t_s=NOW_S - 0.01))
     state = observing(c.state, obs, c.profile)
@@ -537,7 +550,7 @@ def test_what_carries_it_near_its_only_position_is_the_target(
 @pytest.mark.parametrize("later_s", [0.0, 0.5])
 def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
     """Its vertical speed is what they tell with the right delay, and the floor may be near."""
-    dead_reckoning = DeadReckoning(
+    dead_reckoning = DeadReckoningState(
         imu_at_last_update=ImuMotion(t_s=NOW_S - 0.03), velocity_world_mps=(0.0, 0.0, -0.7)
     )
     c = context("imu", dead_reckoned_height_m=2.0, dead_reckoning=dead_reckoning)
@@ -564,7 +577,7 @@ def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
 @pytest.mark.parametrize("behind_s", [0.0, 0.05, 0.5, 5.0])
 def test_without_the_state_block_pictures_measure_the_climb_rate(behind_s: float) -> None:
     """Seed 2612011437: the accelerometer alone was wrong by 0.25 m/s after three seconds."""
-    dead_reckoning = DeadReckoning(
+    dead_reckoning = DeadReckoningState(
         imu_at_last_update=ImuMotion(t_s=NOW_S - 0.03), velocity_world_mps=(0.0, 0.0, -0.7)
     )
     c = context("imu", dead_reckoning=dead_reckoning, tel={"behind_s": behind_s})
@@ -579,7 +592,7 @@ def test_without_the_state_block_pictures_measure_the_climb_rate(behind_s: float
 def test_positions_that_have_diverged_place_the_floor_anywhere(diverged: bool) -> None:
     """Seed 20591183: late motion capture placed the floor 0.9 m too low, and the vehicle struck it
     at the speed that is meant for free air."""
-    dead_reckoning = DeadReckoning(
+    dead_reckoning = DeadReckoningState(
         imu_at_last_update=ImuMotion(t_s=NOW_S), velocity_world_mps=(0.0, 0.0, -0.4)
     )
     c = context(
@@ -602,7 +615,7 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
     state = remembering(
         state_in(Phase.LANDING, z_m=MIN_HEIGHT_TO_INFER_HANGING_M),
         last_telemetry=telemetry(NOW_S, MIN_HEIGHT_TO_INFER_HANGING_M),
-        catch_setpoint_height_above_vehicle_m=1.0,
+        fall_catch_setpoint_above_vehicle_m=1.0,
         condition_start_times_s={MOTORS_OFF_AS_COMMANDED: 0.0, BATTERY_LOW: 1.0},
     )  # fmt: skip
     later_s = NOW_S + hung * profile.positioning.hold_s
@@ -613,10 +626,10 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
         later_s if stale else 0.0
     )
     assert after.belief.condition_start_times_s[BATTERY_LOW] == 1.0
-    assert (after.catch_setpoint_height_above_vehicle_m is None) is stale
+    assert (after.fall_catch_setpoint_above_vehicle_m is None) is stale
     # The setpoint of a catch is far above, and would press; any other is held.
     assert (after.setpoint is None) is stale
-    held = remembering(state, catch_setpoint_height_above_vehicle_m=None)
+    held = remembering(state, fall_catch_setpoint_above_vehicle_m=None)
     assert observing(held, obs, profile).setpoint == held.setpoint
     if positioning == "target":
         assert (after.belief.dead_reckoning_began_at_s is not None) is stale
@@ -624,13 +637,13 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str, hung: fl
 
 # --- Where it is, in the end --------------------------------------------------------------------
 
-UNMOVED, UNRECKONED = ImuMotion(t_s=NOW_S), DeadReckoning()
+UNMOVED, UNRECKONED = ImuMotion(t_s=NOW_S), DeadReckoningState()
 
 
 def ended(
     magnet_reach_entered_at_s: float | None = None,
     imu: ImuMotion = UNMOVED,
-    dead_reckoning: DeadReckoning = UNRECKONED,
+    dead_reckoning: DeadReckoningState = UNRECKONED,
     floor_detected_at_s: float | None = None,
     profile: Profile = BY_TARGET,
     **observed: Any,
@@ -688,7 +701,7 @@ def test_after_a_restart_only_a_new_sighting_shows_the_floor(
         ended(
             NOW_S - 6.0,
             restarted,
-            DeadReckoning(
+            DeadReckoningState(
                 last_telemetry_gap_in_magnet_reach_ended_at_s=NOW_S + restarted_s,
                 last_sighting_at_s=NOW_S + seen_s,
             ),
@@ -716,7 +729,7 @@ def test_what_hangs_stays_in_reach_however_the_accelerometer_drifts(part: float)
         state_in(Phase.LANDING, BEGIN_S, HANG_Z_M), stop_or_land_command_count=6,
         last_stop_or_land_command_at_s=BEGIN_S,
         magnet_reach_entered_at_s=BEGIN_S - 1.0,
-        dead_reckoning=DeadReckoning(gear_below_target_m=0.0),
+        dead_reckoning=DeadReckoningState(gear_below_target_m=0.0),
     )  # fmt: skip
     state = fly(begun, look, 8.0, feels=feels).state
     assert (state.belief.magnet_reach_entered_at_s is not None) is (part < 1.0)
@@ -728,7 +741,7 @@ def test_a_silence_that_may_have_brought_it_to_the_magnet_leaves_it_unknown(
 ) -> None:
     """Whether it counted as in reach since or not: it may have met the floor meanwhile, too. A
     sight or a floor that was felt afterwards tells."""
-    silence = DeadReckoning(last_telemetry_gap_in_magnet_reach_ended_at_s=NOW_S - 3.0)
+    silence = DeadReckoningState(last_telemetry_gap_in_magnet_reach_ended_at_s=NOW_S - 3.0)
     assert ended(magnet_reach_entered_at_s, dead_reckoning=silence) is RestState.UNKNOWN
     assert (
         ended(magnet_reach_entered_at_s, dead_reckoning=silence, floor_detected_at_s=NOW_S - 1.5)
@@ -750,7 +763,7 @@ def test_what_the_watchdog_let_hang_hangs_though_the_loop_never_saw_it(
     obs = at(3.0, obs=seen, thrust=0.0, supervisor=READY)(NOW_S)
     before = state_in(phase, NOW_S - 11.0, HANG_Z_M)
     before = remembering(
-        before, dead_reckoning=DeadReckoning(UNMOVED, gear_below_target_m=gear_below_target_m)
+        before, dead_reckoning=DeadReckoningState(UNMOVED, gear_below_target_m=gear_below_target_m)
     )
     entered = remembering(before, phase=Phase.LANDING, entered_s=NOW_S, t_s=NOW_S)
     new = descent.enter_descent(
@@ -811,7 +824,7 @@ REMEMBERED = st.sampled_from(
             "motor_stop_commanded_at_s": 9.8,
             "stop_or_land_command_count": 2,
         },
-        {"catch_setpoint_height_above_vehicle_m": 1.0},
+        {"fall_catch_setpoint_above_vehicle_m": 1.0},
         {"must_end_press": True},
         {"hover_thrust": 0.0},
         {"dead_reckoning_began_at_s": 9.0, "dead_reckoned_height_m": 1.0},
@@ -878,7 +891,7 @@ def test_nothing_climbs_but_a_catch_and_severity_only_rises(
         floor_m = takeoff_position_m[2] if takeoff_position_m else 0.0
         if (
             isinstance(command, PositionSetpoint)
-            and state.catch_setpoint_height_above_vehicle_m is None
+            and state.fall_catch_setpoint_above_vehicle_m is None
             and before.phase is state.phase
         ):
             assert command.z_m <= max(z_m, floor_m + 0.05) + 1e-9

@@ -13,8 +13,11 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import CameraImuMismatch, Observation, OperatorRequest, Phase, PlannerState
-from perchctl.mission.belief.mounting import MIN_CONTRADICTING_SIGHTINGS, CameraMountingMonitor
-from perchctl.mission.setpoints import TILT_ACCELERATION_DAMPING_S2
+from perchctl.mission.belief.mounting import (
+    MIN_CONTRADICTING_SIGHTINGS_TO_JUDGE_MOUNTING_WRONG,
+    CameraMountingMonitor,
+)
+from perchctl.mission.setpoints import TILT_ACCELERATION_TO_SETPOINT_DAMPING_GAIN_S2
 from perchctl.vehicle import Command, PositionSetpoint, Telemetry
 from tests.helpers.mission import (
     HANG_Z_M,
@@ -73,7 +76,7 @@ def test_a_lean_is_met_by_a_setpoint_on_its_other_side(
     along_m = at_once.x_m * math.cos(towards_rad) + at_once.y_m * math.sin(towards_rad)
     across_m = at_once.y_m * math.cos(towards_rad) - at_once.x_m * math.sin(towards_rad)
     assert along_m == pytest.approx(
-        -TILT_ACCELERATION_DAMPING_S2 * GRAVITY_MPS2 * math.sin(lean_rad), rel=0.05
+        -TILT_ACCELERATION_TO_SETPOINT_DAMPING_GAIN_S2 * GRAVITY_MPS2 * math.sin(lean_rad), rel=0.05
     )
     assert across_m == pytest.approx(0.0, abs=1e-4)
     later = fly(ascending(), leaning(lean_rad, towards_rad, heading_rad, math.inf), 4.0).command
@@ -233,7 +236,8 @@ def test_pictures_and_lean_hold_the_vehicle_where_its_estimate_wanders() -> None
     for pictures in (True, False):
         vehicle = Hovering(0.0, 0.02, wander_m=0.002, pictures=pictures)
         confirmed = remembering(
-            ascending(), mounting=CameraMountingMonitor(is_camera_mounting_confirmed=True)
+            ascending(),
+            camera_mounting_monitor=CameraMountingMonitor(is_camera_mounting_confirmed=True),
         )
         flight = fly(confirmed, vehicle, 20.0, one_phase=True)
         assert flight.ticks[-1].t_s > BEGIN_S + 15.0
@@ -289,11 +293,13 @@ def test_the_pictures_tell_whether_the_vehicle_has_settled(
 def test_a_camera_that_contradicts_the_vehicle_steers_nothing() -> None:
     """Neither one whose mounting is wrong, nor one whose pictures disagree with the
     accelerometer."""
-    turned = CameraMountingMonitor(contradicting_sighting_count=MIN_CONTRADICTING_SIGHTINGS)
+    turned = CameraMountingMonitor(
+        contradicting_sighting_count=MIN_CONTRADICTING_SIGHTINGS_TO_JUDGE_MOUNTING_WRONG
+    )
     late = CameraImuMismatch(0.2, 0.0)
     for state, changes, known in (
         (ascending(), {}, True),
-        (remembering(ascending(), mounting=turned), {}, False),
+        (remembering(ascending(), camera_mounting_monitor=turned), {}, False),
         (ascending(), {"camera_imu_mismatch": late}, False),
     ):
         ticks = fly(state, lambda t_s, c=changes: observation(t_s, Z_M, **c), 0.5).ticks

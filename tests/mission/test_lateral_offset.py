@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission.belief.lateral_offset import (
-    MAX_AGE_OF_NEWEST_PICTURE_S,
-    MAX_VELOCITY_SIGMA_TO_PREDICT_MPS,
+    MAX_FILTER_PREDICTION_TIME_WITHOUT_PICTURE_S,
+    MAX_VELOCITY_SIGMA_TO_USE_FILTER_MPS,
     LateralMotionSample,
     LateralOffsetAndVelocity,
     LateralOffsetFilter,
@@ -154,7 +154,7 @@ def test_the_spread_grows_until_the_estimate_is_unknown() -> None:
     ]
     assert spreads == sorted(spreads)
     assert spreads[-1] > 2.0 * spreads[0]
-    assert filtered.predict(1.5 + MAX_AGE_OF_NEWEST_PICTURE_S + PICTURE_S) is None
+    assert filtered.predict(1.5 + MAX_FILTER_PREDICTION_TIME_WITHOUT_PICTURE_S + PICTURE_S) is None
     assert filtered.predict(0.5) is None
 
 
@@ -163,7 +163,7 @@ def test_nothing_is_known_before_the_pictures_show_a_velocity() -> None:
     one = LateralOffsetFilter().with_picture_measurement(1.0, (0.0, 0.0), 0.001)
     assert one.predict(1.0) is None
     with_more = watch(swaying(0.005, 1.7, 0.0), 0.5)
-    assert known(with_more, 0.5).velocity_sigma_mps < 2.0 * MAX_VELOCITY_SIGMA_TO_PREDICT_MPS
+    assert known(with_more, 0.5).velocity_sigma_mps < 2.0 * MAX_VELOCITY_SIGMA_TO_USE_FILTER_MPS
 
 
 def test_a_step_of_the_pose_is_no_velocity() -> None:

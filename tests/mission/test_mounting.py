@@ -103,7 +103,9 @@ def test_a_landing_for_the_mounting_stops_at_once() -> None:
     """Not where the setpoint had run to: it lies in the wrong direction."""
     ahead = PositionSetpoint(0.3, 0.0, 1.0, 0.0)
     watch = CameraMountingMonitor(contradicting_sighting_count=9, camera_yaw_error_rad=math.pi / 2)
-    flight = fly(remembering(state_in(Phase.ALIGN), mounting=watch, setpoint=ahead), at())
+    flight = fly(
+        remembering(state_in(Phase.ALIGN), camera_mounting_monitor=watch, setpoint=ahead), at()
+    )
     assert flight.state.transition_name == "mounting"
     assert isinstance(flight.command, PositionSetpoint)
     assert math.hypot(flight.command.x_m, flight.command.y_m) < 0.02
@@ -177,7 +179,7 @@ def test_a_right_mounting_flies_on() -> None:
     it = Follows(0.0)
     state = fly(state_in(Phase.ALIGN), it, 3.98).state
     assert state.phase is not Phase.LANDING
-    assert state.belief.mounting.is_camera_mounting_confirmed
+    assert state.belief.camera_mounting_monitor.is_camera_mounting_confirmed
     assert max(it.far_m) > 0.3
     assert it.far_m[15] <= 0.25 * 0.3 + 1e-9
 

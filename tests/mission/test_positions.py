@@ -11,9 +11,9 @@ import pytest
 
 from perchctl.mission import Observation, Outcome, Phase, PlannerState
 from perchctl.mission.belief.contact import current_gear_to_target
-from perchctl.mission.belief.quality import MAX_RECENT_ESTIMATE_MINUS_IMU_VELOCITY_MPS
-from perchctl.mission.belief.reckoning import DeadReckoning
-from perchctl.mission.descent import MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION
+from perchctl.mission.belief.quality import MAX_ESTIMATE_MINUS_IMU_VELOCITY_TO_TRUST_POSITIONS_MPS
+from perchctl.mission.belief.reckoning import DeadReckoningState
+from perchctl.mission.descent import MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION_BY_TELEMETRY
 from perchctl.mission.planner import step_mission
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -512,7 +512,7 @@ def gains_beside(
     state = remembering(
         state,
         last_telemetry=begun.telemetry,
-        dead_reckoning=DeadReckoning(imu_at_last_update=begun.imu),
+        dead_reckoning=DeadReckoningState(imu_at_last_update=begun.imu),
     )
     for t_s in times(lasts_s):
         if not state.belief.is_position_diverged:
@@ -530,8 +530,8 @@ def gains_beside(
 @pytest.mark.parametrize(
     "estimate_only_mps",
     [
-        0.9 * MAX_RECENT_ESTIMATE_MINUS_IMU_VELOCITY_MPS,
-        1.1 * MAX_RECENT_ESTIMATE_MINUS_IMU_VELOCITY_MPS,
+        0.9 * MAX_ESTIMATE_MINUS_IMU_VELOCITY_TO_TRUST_POSITIONS_MPS,
+        1.1 * MAX_ESTIMATE_MINUS_IMU_VELOCITY_TO_TRUST_POSITIONS_MPS,
     ],
 )
 def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
@@ -540,12 +540,12 @@ def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
     """It would follow them to its end: 15 m aside within six seconds, where they are mirrored."""
     begin = remembering(
         state_in(Phase.LANDING),
-        stop_or_land_command_count=MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION,
+        stop_or_land_command_count=MIN_LANDING_COMMANDS_BEFORE_CONFIRMATION_BY_TELEMETRY,
         last_stop_or_land_command_at_s=BEGIN_S,
     )
     state, command = gains_beside(begin, -estimate_only_mps, 0.2)
     assert state.belief.is_position_diverged is (
-        estimate_only_mps > MAX_RECENT_ESTIMATE_MINUS_IMU_VELOCITY_MPS
+        estimate_only_mps > MAX_ESTIMATE_MINUS_IMU_VELOCITY_TO_TRUST_POSITIONS_MPS
     )
     assert isinstance(command, RawThrust) is state.belief.is_position_diverged
 

@@ -22,7 +22,10 @@ from perchctl.mission import (
     Phase,
     planner,
 )
-from perchctl.mission.belief.mounting import MIN_CONTRADICTING_SIGHTINGS, CameraMountingMonitor
+from perchctl.mission.belief.mounting import (
+    MIN_CONTRADICTING_SIGHTINGS_TO_JUDGE_MOUNTING_WRONG,
+    CameraMountingMonitor,
+)
 from perchctl.mission.phase import PRE_LANDING_PHASES, Severity
 from perchctl.mission.phases.align import ALIGNED, MAX_WAIT_FOR_CLIMB_PERMISSION_S
 from perchctl.mission.table import (
@@ -196,7 +199,7 @@ CASES: dict[str, Case] = {
     "mounting": Case(
         P.ALIGN, P.LANDING, seen(), 0.1, O.SAFETY,
         state={"mounting":
-        CameraMountingMonitor(contradicting_sighting_count=MIN_CONTRADICTING_SIGHTINGS)},
+        CameraMountingMonitor(contradicting_sighting_count=MIN_CONTRADICTING_SIGHTINGS_TO_JUDGE_MOUNTING_WRONG)},
     ),
     "height-limit": Case(P.SEARCH, P.LANDING, unseen(3.4), 0.1, O.SAFETY, z_m=3.4),
     "fence": Case(P.ALIGN, P.LANDING, aside(2.5), 0.1, O.SAFETY),
@@ -205,7 +208,7 @@ CASES: dict[str, Case] = {
         P.ALIGN, P.LANDING, seen(last_good_frame_age_s=4.0, has_new_frame=False), 0.1, O.SAFETY
     ),
     "loop-late": Case(P.ALIGN, P.LANDING, seen(tick_start_delay_s=1.2), 0.1, O.SAFETY),
-    "markers-disagree": Case(P.ALIGN, P.LANDING, seen(successive_marker_conflicts=40), 0.1,
+    "markers-disagree": Case(P.ALIGN, P.LANDING, seen(consecutive_marker_conflict_frames=40), 0.1,
         O.SAFETY),
     "log-lost": Case(
         P.ALIGN, P.LANDING, seen(flight_log_problem="disk full"), 0.1, O.SAFETY, profile=LAND_ON_LOG

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import ImuMotion, Observation, OperatorRequest, Phase, PlannerState
 from perchctl.mission.belief.belief import (
-    MAX_VELOCITY_CORRECTION_AGE_BEYOND_CAMERA_LATENCY_S,
-    MIN_SPEED_GAINED_IN_GUST_MPS,
+    MAX_POSITION_AGE_BEYOND_LATENCY_TO_CORRECT_VELOCITY_S,
+    MIN_LATERAL_SPEED_GAIN_TO_DETECT_GUST_MPS,
 )
-from perchctl.mission.belief.reckoning import DeadReckoning
+from perchctl.mission.belief.reckoning import DeadReckoningState
 from perchctl.mission.level_descent import (
     BRAKE_TILT_GAIN_RAD_PER_MPS,
     MAX_BRAKE_TILT_RAD,
@@ -28,7 +28,7 @@ from perchctl.mission.phase import Severity
 from perchctl.mission.planner import step_mission
 from perchctl.mission.release import (
     MAX_LATERAL_SPEED_BRAKED_IN_FALL_CATCH_MPS,
-    ONBOARD_POSITION_GAIN_PER_S,
+    ONBOARD_POSITION_TO_VELOCITY_GAIN_PER_S,
 )
 from perchctl.mission.setpoints import MIN_HELD_SETPOINT_HEIGHT_ABOVE_GROUND_M
 from perchctl.vehicle import PositionSetpoint, RawThrust, StopMotors
@@ -68,7 +68,7 @@ def blinded(
     z_m: float, velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0), **changes: object
 ) -> PlannerState:
     """On its way down by accelerometer and attitude alone, with that reckoned speed."""
-    dead_reckoning = DeadReckoning(
+    dead_reckoning = DeadReckoningState(
         imu_at_last_update=ImuMotion(t_s=BEGIN_S), velocity_world_mps=velocity_mps
     )
     state = remembering(
@@ -180,7 +180,7 @@ def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked
 ) -> None:
     """For 0.1 s without a sight: sideways the estimate feels none of it."""
     gained_mps = 9.81 * 0.1 * math.hypot(aside_g, ahead_g)
-    assume(abs(gained_mps - MIN_SPEED_GAINED_IN_GUST_MPS) >= 0.05)
+    assume(abs(gained_mps - MIN_LATERAL_SPEED_GAIN_TO_DETECT_GUST_MPS) >= 0.05)
 
     def look(t_s: float) -> Observation:
         passed_s = t_s - BEGIN_S
@@ -189,12 +189,14 @@ def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked
         return unseen(1.0, for_s=max(0.01, passed_s - 0.1), yaw_rad=yaw_rad, **felt)(t_s)
 
     flight = fly(state_in(Phase.ALIGN), look, 0.58, PROFILE, feels=True, one_phase=True)
-    assert (flight.state.phase is Phase.LANDING) is (gained_mps > MIN_SPEED_GAINED_IN_GUST_MPS)
+    assert (flight.state.phase is Phase.LANDING) is (
+        gained_mps > MIN_LATERAL_SPEED_GAIN_TO_DETECT_GUST_MPS
+    )
     if flight.state.phase is Phase.LANDING:
         assert flight.state.transition_name == "position-lost"
         assert (
             flight.ticks[-1].t_s - BEGIN_S
-            >= 0.1 + MAX_VELOCITY_CORRECTION_AGE_BEYOND_CAMERA_LATENCY_S
+            >= 0.1 + MAX_POSITION_AGE_BEYOND_LATENCY_TO_CORRECT_VELOCITY_S
         )
         assert isinstance(flight.command, RawThrust)
         assert flight.command.pitch_rad * ahead_g <= 1e-3
@@ -234,13 +236,13 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     """Knocked off the magnet it is caught by position, and the position mode would tilt it by its
     estimate, which has felt no blow: the setpoint asks for the opposite of what that lacks."""
     unknown_mps = math.hypot(x_mps, y_mps)
-    assume(abs(unknown_mps - MIN_SPEED_GAINED_IN_GUST_MPS) > 0.01)
+    assume(abs(unknown_mps - MIN_LATERAL_SPEED_GAIN_TO_DETECT_GUST_MPS) > 0.01)
     imu = ImuMotion(t_s=BEGIN_S)
     state = remembering(
         state_in(Phase.LANDING, z_m=1.9), vehicle_world_z_at_last_contact_m=1.9,
         weight_transfer_began_at_s=BEGIN_S - 1.0,
         magnet_reach_entered_at_s=BEGIN_S - 6.0, dead_reckoning_began_at_s=BEGIN_S - 3.0,
-        dead_reckoning=DeadReckoning(
+        dead_reckoning=DeadReckoningState(
             imu_at_last_update=imu, velocity_world_mps=(x_mps, y_mps, -0.5),
             recent_imu_minus_estimate_velocity_world_xy_mps=(x_mps, y_mps),
         ),
@@ -250,13 +252,15 @@ def test_a_catch_brakes_a_speed_aside_that_the_estimate_has_not(x_mps: float, y_
     _, command = step_mission(state, obs, PROFILE)
     assert is_setpoint(command, above_m=1.85)
     assert isinstance(command, PositionSetpoint)
-    if unknown_mps > MIN_SPEED_GAINED_IN_GUST_MPS:
+    if unknown_mps > MIN_LATERAL_SPEED_GAIN_TO_DETECT_GUST_MPS:
         for way_m, mps in ((command.x_m, x_mps), (command.y_m, y_mps)):
             braked_mps = max(
                 -MAX_LATERAL_SPEED_BRAKED_IN_FALL_CATCH_MPS,
                 min(MAX_LATERAL_SPEED_BRAKED_IN_FALL_CATCH_MPS, mps),
             )
-            assert way_m == pytest.approx(-braked_mps / ONBOARD_POSITION_GAIN_PER_S, abs=0.02)
+            assert way_m == pytest.approx(
+                -braked_mps / ONBOARD_POSITION_TO_VELOCITY_GAIN_PER_S, abs=0.02
+            )
     else:
         assert (command.x_m, command.y_m) == (0.0, 0.0)
 

@@ -104,7 +104,9 @@ def test_how_little_thrust_proves_that_the_magnet_holds(
 )
 def test_only_quiet_flight_teaches_the_hover_thrust(how: dict[str, Any], learns: bool) -> None:
     start = remembering(
-        state_in(Phase.ESTIMATE), hover_thrust=0.0, recent_max_target_shift_per_frame_m=1.0
+        state_in(Phase.ESTIMATE),
+        hover_thrust=0.0,
+        recent_max_target_world_shift_between_pictures_m=1.0,
     )
     after = flown(start, 0.3, thrust=50000.0, **how)
     assert after.belief.hover_thrust == (50000.0 if learns else 0.0)
@@ -269,7 +271,7 @@ def test_what_backs_off_from_a_press_is_not_held_to_it() -> None:
     saturated = {NOT_CLIMBING_AT_FULL_THRUST: 10.5}
     above = state_in(Phase.PERCH, 10.0, CONTACT_Z_M + 0.25)
     state = remembering(
-        above, condition_start_times_s=saturated, catch_setpoint_height_above_vehicle_m=None
+        above, condition_start_times_s=saturated, fall_catch_setpoint_above_vehicle_m=None
     )
     for _ in range(2):
         state, command = planner.step_mission(state, pressed_late(t_s, 0.3), PROFILE)

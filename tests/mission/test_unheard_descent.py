@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import Observation, Phase, PlannerState, VisualInertialMotion
-from perchctl.mission.belief.target import VisualMotion
-from perchctl.mission.belief.thrust import HoverThrust
+from perchctl.mission.belief.target import VisualVelocityFilter
+from perchctl.mission.belief.thrust import HoverThrustEstimate
 from perchctl.mission.planner import step_mission
 from perchctl.values import replace
 from perchctl.vehicle import Command, PositionSetpoint, RawThrust
@@ -45,9 +45,9 @@ def watched(
     velocity_mps: tuple[float, float, float],
     rate_hz: float,
     lasts_s: float = 1.0,
-) -> VisualMotion:
+) -> VisualVelocityFilter:
     """The motion of a vehicle that leaves `place_m` below a target at this velocity."""
-    motion = VisualMotion()
+    motion = VisualVelocityFilter()
     for i in range(int(lasts_s * rate_hz) + 1):
         t_s = BEGIN_S + i / rate_hz
         e_m = np.array(place_m) - np.array(velocity_mps) * (t_s - BEGIN_S)
@@ -179,12 +179,12 @@ def come_down(
     return commands
 
 
-def seen_before(vehicle: Falling) -> VisualMotion:
+def seen_before(vehicle: Falling) -> VisualVelocityFilter:
     """What pictures have shown of the vehicle for a second before the descent begins."""
     below_m = CEILING_M - vehicle.z_m - BY_TARGET.vehicle.gear_body_m[2]
     newest_s = BEGIN_S - PICTURES_LATE_S - TICK_S
     velocity_mps = (0.0, 0.0, vehicle.climb_mps)
-    return VisualMotion(newest_s, newest_s - 1.0, (0.0, 0.0, below_m), velocity_mps)
+    return VisualVelocityFilter(newest_s, newest_s - 1.0, (0.0, 0.0, below_m), velocity_mps)
 
 
 def raw_orders(commands: list[Command], begin_s: float, end_s: float) -> list[RawThrust]:
@@ -211,7 +211,7 @@ def test_a_climb_in_the_pictures_is_braked_and_is_no_floor(
     """The small thrust that brakes it, and the moment in which the vehicle turns round, looked like
     a vehicle on the floor: it dropped from 0.45 m (seed 2612015017)."""
     vehicle = Falling(0.45, climb_mps, strength)
-    come_down(vehicle, 6.0, visual_motion=seen_before(vehicle))
+    come_down(vehicle, 6.0, visual_velocity_filter=seen_before(vehicle))
     assert vehicle.touched_mps is not None
     assert -0.75 < vehicle.touched_mps < 0.0
 
@@ -224,7 +224,7 @@ def test_a_loop_that_stood_still_takes_the_vehicle_for_no_floor(begin_s: float) 
         vehicle,
         8.0,
         stands_still=lambda t_s: begin_s <= t_s < begin_s + 0.56,
-        visual_motion=seen_before(vehicle),
+        visual_velocity_filter=seen_before(vehicle),
     )
     assert vehicle.touched_mps is not None
     assert -0.75 < vehicle.touched_mps < 0.0
@@ -233,7 +233,9 @@ def test_a_loop_that_stood_still_takes_the_vehicle_for_no_floor(begin_s: float) 
 def test_a_thrust_that_was_too_small_before_the_descent_proves_no_floor() -> None:
     vehicle = Falling(1.5, 0.0, 1.0)
     seen = seen_before(vehicle)
-    come_down(vehicle, 8.0, visual_motion=seen, thrust_too_low_to_fly_since_s=BEGIN_S - 3.0)
+    come_down(
+        vehicle, 8.0, visual_velocity_filter=seen, thrust_too_low_to_fly_since_s=BEGIN_S - 3.0
+    )
     assert vehicle.touched_mps is not None
     assert -0.75 < vehicle.touched_mps < 0.0
 
@@ -245,9 +247,9 @@ def test_with_an_unsure_hover_thrust_setpoints_come_first_also_with_pictures(
     """Just after take-off it is 15 % too small; by pictures, which are late, the vehicle dropped
     from 0.3 m (seed 2612011472)."""
     vehicle = Falling(0.3, 0.0, 1.0)
-    known = HoverThrust(HOVER_THRUST, sigma_fraction)
+    known = HoverThrustEstimate(HOVER_THRUST, sigma_fraction)
     orders = come_down(
-        vehicle, 1.6, visual_motion=seen_before(vehicle), hover_thrust_estimate=known
+        vehicle, 1.6, visual_velocity_filter=seen_before(vehicle), hover_thrust_estimate=known
     )
     waits_s = TICK_S * sum(isinstance(order, PositionSetpoint) for order in orders)
     assert waits_s == pytest.approx(1.5 if sigma_fraction > 0.05 else 0.0, abs=0.05)
@@ -258,11 +260,11 @@ def test_setpoints_do_not_come_first_on_an_estimate_that_is_known_to_be_wrong(
     known_wrong: str,
 ) -> None:
     vehicle = Falling(1.0, 0.0, 1.0)
-    unsure = HoverThrust(HOVER_THRUST, 0.12)
+    unsure = HoverThrustEstimate(HOVER_THRUST, 0.12)
     orders = come_down(
         vehicle,
         1.0,
-        visual_motion=seen_before(vehicle),
+        visual_velocity_filter=seen_before(vehicle),
         hover_thrust_estimate=unsure,
         **{known_wrong: True},
     )

@@ -202,7 +202,9 @@ def test_a_landing_stops_no_motor_without_the_floor_or_the_ceiling(
             ground_z_m[t_s] = state.belief.takeoff_position_m[2]
             if isinstance(command, StopMotors):
                 floor = on_the_floor(
-                    seen, ground_z_m, state.entry.position_m[2] - state.belief.takeoff_position_m[2]
+                    seen,
+                    ground_z_m,
+                    state.entry.vehicle_world_position_m[2] - state.belief.takeoff_position_m[2],
                 )
                 ceiling = (begin or state.weight_transfer_began_at_s) and on_the_ceiling(seen)
                 assert floor or ceiling or (state.weight_transfer_began_at_s and motors_off(seen))
@@ -541,7 +543,7 @@ def test_nothing_is_caught_on_an_old_speed() -> None:
     """Two seconds of full thrust on a speed of long ago would end far above."""
     below = PositionSetpoint(0.0, 0.0, HANG_Z_M - 0.25, 0.0)
     slipped = landing(
-        HANG_Z_M, Phase.RECOVER, catch_setpoint_height_above_vehicle_m=1.0, setpoint=below
+        HANG_Z_M, Phase.RECOVER, fall_catch_setpoint_above_vehicle_m=1.0, setpoint=below
     )
     late = at(HANG_Z_M - 0.1, age_s=0.2, velocity_mps=SINKS, thrust=1000.0, acc_z_g=0.2)
     _, command = step_mission(slipped, late(10.08), PROFILE)
@@ -566,7 +568,7 @@ def test_a_step_behind_missing_samples_may_be_the_vehicle_s(gap_s: float, moves:
     assert new.belief.takeoff_position_m[2] - state.belief.takeoff_position_m[2] == pytest.approx(
         -0.98 if moves else 0.0
     )
-    assert not moves or new.entry.position_m[2] == pytest.approx(
+    assert not moves or new.entry.vehicle_world_position_m[2] == pytest.approx(
         0.02
     )  # it has not moved: held where it is
 

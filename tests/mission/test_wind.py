@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission import ImuMotion, Observation, OperatorRequest, Phase
-from perchctl.mission.belief.reckoning import DeadReckoning, advance_dead_reckoning
+from perchctl.mission.belief.reckoning import DeadReckoningState, advance_dead_reckoning
 from perchctl.mission.phases.recover import STEADY_AFTER_ATTEMPT
 from perchctl.mission.setpoints import (
-    MAX_LATERAL_INTEGRAL_SHIFT_M,
+    MAX_INTEGRAL_SETPOINT_SHIFT_M,
     MAX_SPEED_TO_COUNT_AS_HOVERING_MPS,
 )
 from perchctl.vehicle import PositionSetpoint
@@ -85,7 +85,7 @@ def test_an_offset_in_which_the_vehicle_stands_is_trimmed(
     along_m = x_m * math.cos(towards_rad) + y_m * math.sin(towards_rad)
     gain = MOCAP.planner.integral_per_s * 1.5
     assert along_m == pytest.approx(
-        -min(gain * lateral_offset_m, MAX_LATERAL_INTEGRAL_SHIFT_M), rel=0.1
+        -min(gain * lateral_offset_m, MAX_INTEGRAL_SETPOINT_SHIFT_M), rel=0.1
     )
 
 
@@ -132,7 +132,7 @@ def test_what_holds_against_the_wind_is_learned_and_a_kick_is_not(
         wind_g * math.cos(towards_rad - heading_rad),
         wind_g * math.sin(towards_rad - heading_rad),
     )
-    dead_reckoning, imu, last = DeadReckoning(), ImuMotion(), None
+    dead_reckoning, imu, last = DeadReckoningState(), ImuMotion(), None
     for k in range(2400):
         kicked_g = 1.7 if 2000 <= k < 2004 else 0.0
         sample = telemetry(

@@ -67,7 +67,7 @@ def test_a_changed_constant_is_named_by_tick_and_field(
     """By the last bit: 0.25 s and the next number above it. That much may be tolerated."""
     log = logs("perched")
     assert replay(log).is_identical
-    monkeypatch.setattr(setpoints, "HEIGHT_DAMPING_S", 0.25000000000000006)
+    monkeypatch.setattr(setpoints, "CLIMB_RATE_TO_SETPOINT_DAMPING_GAIN_S", 0.25000000000000006)
     found = replay(log)
     first = found.differences[0]
     assert first.field == "command.z_m"

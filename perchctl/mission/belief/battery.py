@@ -56,20 +56,20 @@ values are slightly below those in the firmware's table."""
 TYPICAL_FULL_THRUST_SAG_V = 0.63
 """Voltage sag of a typical battery at full thrust, V. Larger: perchctl refuses attempts that the
 battery could finish."""
-FULL_THRUST_SAG_SIGMA_V = 0.3
+FULL_THRUST_SAG_PRIOR_SIGMA_V = 0.3
 """Standard deviation of the sag between batteries, V. Smaller: the fit takes longer to recognize a
 worn battery."""
-MIN_FULL_THRUST_SAG_V = 0.2
+MIN_FITTED_FULL_THRUST_SAG_V = 0.2
 """Lower bound of the fitted sag, V; no battery sags less."""
 TYPICAL_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO = 1.1
 """Discharge rate of a typical battery, divided by the rate calculated from the assumed current."""
-TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO_SIGMA = 0.3
+TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO_PRIOR_SIGMA = 0.3
 """Standard deviation of the ratio of true to calculated discharge between batteries."""
-MIN_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO = 1.0
+MIN_FITTED_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO = 1.0
 """Lower bound of the fitted ratio of true to calculated discharge."""
-MAX_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO = 3.0
+MAX_FITTED_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO = 3.0
 """Upper bound of the fitted ratio of true to calculated discharge."""
-ONE_SECOND_MEAN_VOLTAGE_SIGMA_V = 0.02
+ONE_SECOND_MEAN_VOLTAGE_READING_SIGMA_V = 0.02
 """Standard deviation of the mean of the voltage readings over one second, V."""
 BATTERY_FIT_FORGETTING_TIME_CONSTANT_S = 40.0
 """Time constant with which the fit forgets old readings, s. Larger: the fit adapts too slowly to a
@@ -78,21 +78,21 @@ REST_VOLTAGE_FILTER_TIME_CONSTANT_S = 1.0
 """Time constant of the low-pass filter on the resting voltage, s."""
 THRUST_TO_VOLTAGE_LAG_TIME_CONSTANT_S = 0.3
 """Time constant with which the voltage reading follows a change in thrust, s."""
-MAX_THRUST_FRACTION_CHANGE_TO_USE_VOLTAGE = 0.06
+MAX_RECENT_THRUST_CHANGE_FRACTION_TO_USE_VOLTAGE = 0.06
 """Largest difference between the present load and the filtered load, as a fraction of full thrust.
 With a larger difference, the voltage reading still reflects an earlier thrust and is not used."""
-MIN_CHARGE_FRACTION_FOR_COULOMB_COUNTING = 0.05
+MIN_CHARGE_FRACTION_TO_USE_COULOMB_COUNTING = 0.05
 """Fraction of the full charge below which the discharge calculated from the assumed current is not
 used: the voltage curve is so steep there that the readings alone determine the charge."""
-MIN_THRUST_FRACTION_FOR_BATTERY_FIT = 0.2
+MIN_THRUST_FRACTION_TO_FIT_BATTERY_MODEL = 0.2
 """Smallest load, as a fraction of full thrust, at which a reading contributes to the fitted sag."""
-MIN_TIME_UNDER_LOAD_FOR_BATTERY_FIT_S = 1.0
+MIN_TIME_UNDER_LOAD_TO_FIT_BATTERY_MODEL_S = 1.0
 """Total time of readings under load that an estimate requires, s."""
 FIRMWARE_LOW_POWER_REPORT_DELAY_S = 5.0
 """Time below the low-power voltage after which the firmware reports low power, s (from the power
 management in the firmware source). Larger: perchctl starts attempts that the battery cannot
 finish."""
-MAX_BATTERY_READING_AGE_S = 1.0
+MAX_BATTERY_READING_AGE_TO_UPDATE_FIT_S = 1.0
 """Age beyond which a voltage reading is no longer used, s."""
 
 
@@ -104,7 +104,7 @@ class BatteryVoltageModel(NamedTuple):
     true_to_coulomb_counted_discharge_ratio: float
 
 
-class NormalEquationSums(NamedTuple):
+class BatteryNormalEquationSums(NamedTuple):
     """Weighted sums over the voltage readings: the normal equations of the least-squares fit.
 
     The error of a reading is its deviation, V, from what `TYPICAL_FULL_THRUST_SAG_V` and
@@ -121,11 +121,11 @@ class NormalEquationSums(NamedTuple):
     rest_v_drop_times_voltage_error: float = 0.0
 
 
-ZERO_SUMS = NormalEquationSums()
+ZERO_NORMAL_EQUATION_SUMS = BatteryNormalEquationSums()
 
 
 @dataclass(frozen=True)
-class BatteryFit:
+class BatteryFitState:
     """State of the battery fit after the newest reading. The fit determines two unknowns: the
     voltage sag at full thrust, V, and the true discharge rate divided by the rate calculated from
     the assumed current.
@@ -155,7 +155,7 @@ class BatteryFit:
     rest_v: float | None = None  # estimated resting voltage now
     time_under_load_s: float = 0.0  # total time covered by readings under load
     time_since_battery_reading_s: float = 0.0  # time since the last reading
-    normal_equation_sums: NormalEquationSums = ZERO_SUMS
+    normal_equation_sums: BatteryNormalEquationSums = ZERO_NORMAL_EQUATION_SUMS
 
 
 # --- Brushed and brushless motors ---
@@ -194,22 +194,22 @@ def identify_power_train(telemetry: Telemetry) -> PowerTrain:
 
 
 def update_battery_fit_from_telemetry(
-    old: BatteryFit,
+    old: BatteryFitState,
     telemetry: Telemetry,
     reading_age_s: float,
     dt_s: float,
     battery_capacity_mah: float,
-) -> BatteryFit:
+) -> BatteryFitState:
     """Return the fit `dt_s` later, in a tick whose newest sample is `telemetry`, for a battery with
     the full charge `battery_capacity_mah`.
 
-    `reading_age_s` is the time since the voltage last changed. After `MAX_BATTERY_READING_AGE_S`, a
-    reading counts as missing (see `update_battery_fit`), unless the motors have not turned yet: a
-    battery at rest keeps its voltage, and without this resting voltage the fit cannot tell a large
-    sag from a small charge.
+    `reading_age_s` is the time since the voltage last changed. After
+    `MAX_BATTERY_READING_AGE_TO_UPDATE_FIT_S`, a reading counts as missing (see
+    `update_battery_fit`), unless the motors have not turned yet: a battery at rest keeps its
+    voltage, and without this resting voltage the fit cannot tell a large sag from a small charge.
     """
     is_resting = telemetry.thrust == 0.0 and not old.time_under_load_s
-    is_current = reading_age_s <= MAX_BATTERY_READING_AGE_S
+    is_current = reading_age_s <= MAX_BATTERY_READING_AGE_TO_UPDATE_FIT_S
     reading_v = telemetry.battery_v if is_current or is_resting else math.nan
     power_train = identify_power_train(telemetry)
     return update_battery_fit(
@@ -218,13 +218,13 @@ def update_battery_fit_from_telemetry(
 
 
 def update_battery_fit(
-    state: BatteryFit,
+    state: BatteryFitState,
     dt_s: float,
     battery_v: float,
     raw_thrust: float,
     battery_capacity_mah: float,
     power_train: PowerTrain,
-) -> BatteryFit:
+) -> BatteryFitState:
     """Return the fit `dt_s` later, after the voltage reading `battery_v`, V, at the commanded
     thrust `raw_thrust` (0..65535), for a battery with the full charge `battery_capacity_mah`.
 
@@ -247,7 +247,7 @@ def update_battery_fit(
             dt_s / THRUST_TO_VOLTAGE_LAG_TIME_CONSTANT_S,
         ),
     )
-    if thrust_fraction >= MIN_THRUST_FRACTION_FOR_BATTERY_FIT:
+    if thrust_fraction >= MIN_THRUST_FRACTION_TO_FIT_BATTERY_MODEL:
         known = dt_s / 3.0 if state.mean_airborne_thrust_fraction else 1.0
         state = replace(
             state,
@@ -277,7 +277,7 @@ def update_battery_fit(
         return replace(state, takeoff_rest_v=battery_v, rest_v=battery_v)
     if (
         abs(thrust_fraction - state.lagged_thrust_fraction)
-        > MAX_THRUST_FRACTION_CHANGE_TO_USE_VOLTAGE
+        > MAX_RECENT_THRUST_CHANGE_FRACTION_TO_USE_VOLTAGE
     ):
         return state
     if state.takeoff_rest_v is None:
@@ -285,7 +285,7 @@ def update_battery_fit(
             state,
             takeoff_rest_v=battery_v + TYPICAL_FULL_THRUST_SAG_V * state.lagged_thrust_fraction,
         )
-    if state.lagged_thrust_fraction >= MIN_THRUST_FRACTION_FOR_BATTERY_FIT:
+    if state.lagged_thrust_fraction >= MIN_THRUST_FRACTION_TO_FIT_BATTERY_MODEL:
         fit = _add_voltage_reading_to_sums(state, dt_s, battery_v)
         state = replace(
             state, normal_equation_sums=fit, time_under_load_s=state.time_under_load_s + dt_s
@@ -302,23 +302,24 @@ def update_battery_fit(
     return replace(state, rest_v=rest_v)
 
 
-def fit_battery_voltage_model(state: BatteryFit) -> BatteryVoltageModel:
+def fit_battery_voltage_model(state: BatteryFitState) -> BatteryVoltageModel:
     """Return the battery voltage model that fits the readings best: least squares, regularized by
     the typical values and bounded."""
     a, b, c, p, q = state.normal_equation_sums
-    a += FULL_THRUST_SAG_SIGMA_V**-2
-    c += TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO_SIGMA**-2
+    a += FULL_THRUST_SAG_PRIOR_SIGMA_V**-2
+    c += TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO_PRIOR_SIGMA**-2
     det = a * c - b * b
     sag_v = TYPICAL_FULL_THRUST_SAG_V + (c * p - b * q) / det
     true_to_coulomb_counted_discharge_ratio = (
         TYPICAL_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO + (a * q - b * p) / det
     )
     return BatteryVoltageModel(
-        max(MIN_FULL_THRUST_SAG_V, sag_v),
+        max(MIN_FITTED_FULL_THRUST_SAG_V, sag_v),
         min(
-            MAX_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO,
+            MAX_FITTED_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO,
             max(
-                MIN_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO, true_to_coulomb_counted_discharge_ratio
+                MIN_FITTED_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO,
+                true_to_coulomb_counted_discharge_ratio,
             ),
         ),
     )
@@ -350,8 +351,8 @@ def _interpolate(xs: tuple[float, ...], ys: tuple[float, ...], x: float) -> floa
 
 
 def _add_voltage_reading_to_sums(
-    state: BatteryFit, dt_s: float, battery_v: float
-) -> NormalEquationSums:
+    state: BatteryFitState, dt_s: float, battery_v: float
+) -> BatteryNormalEquationSums:
     """Return the sums after one more reading `battery_v`, V, under load, with a weight proportional
     to `dt_s`, the time that the reading covers. Older readings lose weight with the time constant
     `BATTERY_FIT_FORGETTING_TIME_CONSTANT_S`.
@@ -362,7 +363,7 @@ def _add_voltage_reading_to_sums(
     assert state.takeoff_rest_v is not None
     begun = charge_fraction_from_rest_v(state.takeoff_rest_v)
     counted = max(
-        min(begun, MIN_CHARGE_FRACTION_FOR_COULOMB_COUNTING),
+        min(begun, MIN_CHARGE_FRACTION_TO_USE_COULOMB_COUNTING),
         begun - state.coulomb_counted_discharge_fraction,
     )
     spent_v = rest_v_from_charge_fraction(begun) - rest_v_from_charge_fraction(counted)
@@ -373,11 +374,11 @@ def _add_voltage_reading_to_sums(
         - TYPICAL_TRUE_TO_COULOMB_COUNTED_DISCHARGE_RATIO * spent_v
     )
     weight, keep = (
-        dt_s / ONE_SECOND_MEAN_VOLTAGE_SIGMA_V**2,
+        dt_s / ONE_SECOND_MEAN_VOLTAGE_READING_SIGMA_V**2,
         math.exp(-dt_s / BATTERY_FIT_FORGETTING_TIME_CONSTANT_S),
     )
     a, b, c, p, q = (keep * each for each in state.normal_equation_sums)
-    return NormalEquationSums(
+    return BatteryNormalEquationSums(
         a + weight * state.lagged_thrust_fraction * state.lagged_thrust_fraction,
         b + weight * state.lagged_thrust_fraction * spent_v,
         c + weight * spent_v * spent_v,

@@ -13,15 +13,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from perchctl.geometry import GRAVITY_MPS2, Array
-from perchctl.mission.belief.battery import BatteryFit
+from perchctl.mission.belief.battery import BatteryFitState
 from perchctl.mission.belief.evidence import Condition
 from perchctl.mission.belief.lateral_offset import LateralOffsetAndVelocity, LateralOffsetFilter
 from perchctl.mission.belief.maneuver import CommandHistory, Maneuver
 from perchctl.mission.belief.motion import ZERO_VECTOR, ImuMotion, Vector
 from perchctl.mission.belief.mounting import CameraMountingMonitor
-from perchctl.mission.belief.reckoning import DeadReckoning
-from perchctl.mission.belief.target import TargetBelief, VisualMotion
-from perchctl.mission.belief.thrust import HoverThrust
+from perchctl.mission.belief.reckoning import DeadReckoningState
+from perchctl.mission.belief.target import TargetBelief, VisualVelocityFilter
+from perchctl.mission.belief.thrust import HoverThrustEstimate
 from perchctl.mission.observation import CameraImuMismatch, Observation
 from perchctl.profile import Profile
 from perchctl.values import cached_property, replace
@@ -30,19 +30,19 @@ from perchctl.vehicle import Telemetry
 ESTIMATE_SETTLING_TIME_AFTER_POSITIONS_RETURN_S = 0.5
 """Time that the state estimate needs to converge once positions return after a gap, s. Smaller: the
 estimate is trusted before it has converged."""
-MAX_VELOCITY_CORRECTION_AGE_BEYOND_CAMERA_LATENCY_S = 0.13
+MAX_POSITION_AGE_BEYOND_LATENCY_TO_CORRECT_VELOCITY_S = 0.13
 """Largest age of the newest external position, in addition to the camera's latency, at which it
 still corrects the estimated velocity, s: four picture intervals at 30 per second, so three lost
 pictures make no difference. Larger: `is_estimate_missing_gust` detects an impact later."""
-MIN_SPEED_GAINED_IN_GUST_MPS = 0.2
+MIN_LATERAL_SPEED_GAIN_TO_DETECT_GUST_MPS = 0.2
 """Lateral speed, gained without a sighting, above which the cause must be an impact or gust, m/s;
 flights without a fault show 0.06 m/s. Larger: an impact goes unnoticed. Smaller: an attitude error
 counts as an impact."""
-GUST_SPEED_THRESHOLD_INCREASE_PER_LATENCY_SIGMA_MPS2 = 2.0
-"""Increase of `MIN_SPEED_GAINED_IN_GUST_MPS`, in m/s per second of the latency's standard
-deviation; the increase is necessary because the vehicle oscillates if pictures are 0.1 s later than
-assumed. Larger: with an uncertain latency, impacts go unnoticed."""
-MAX_THRUST_REPORT_DELAY_S = 0.2
+GUST_DETECTION_THRESHOLD_INCREASE_PER_LATENCY_SIGMA_MPS2 = 2.0
+"""Increase of `MIN_LATERAL_SPEED_GAIN_TO_DETECT_GUST_MPS`, in m/s per second of the latency's
+standard deviation; the increase is necessary because the vehicle oscillates if pictures are 0.1 s
+later than assumed. Larger: with an uncertain latency, impacts go unnoticed."""
+MAX_COMMAND_TO_REPORTED_THRUST_DELAY_S = 0.2
 """Time within which the telemetry reports a commanded raw thrust, s. Smaller: with late telemetry,
 the vehicle seems to ignore the commanded thrust."""
 
@@ -101,16 +101,16 @@ class Belief:
     dead_reckoned_height_m: float = 0.0
 
     # --- motion, target and contact ---
-    dead_reckoning: DeadReckoning = field(default_factory=DeadReckoning)
+    dead_reckoning: DeadReckoningState = field(default_factory=DeadReckoningState)
     #: target's position in world axes, m, in the last frame that measured it
     last_target_position_world_m: Array | None = None
     #: decaying maximum of the target's movement in the world between successive measured frames
-    recent_max_target_shift_per_frame_m: float = 0.0
+    recent_max_target_world_shift_between_pictures_m: float = 0.0
     #: vehicle's velocity from pictures alone
-    visual_motion: VisualMotion = field(default_factory=VisualMotion)
+    visual_velocity_filter: VisualVelocityFilter = field(default_factory=VisualVelocityFilter)
     #: Kalman filter of the lateral offset from the target
     lateral_offset_filter: LateralOffsetFilter = field(default_factory=LateralOffsetFilter)
-    mounting: CameraMountingMonitor = field(default_factory=CameraMountingMonitor)
+    camera_mounting_monitor: CameraMountingMonitor = field(default_factory=CameraMountingMonitor)
     #: low-passed `thrust_direction_world_xy` (time constant
     #: `MEAN_THRUST_DIRECTION_TIME_CONSTANT_S`)
     mean_thrust_direction_world_xy: tuple[float, float] = (0.0, 0.0)
@@ -123,14 +123,17 @@ class Belief:
     condition_start_times_s: dict[Condition[Any], float] = field(default_factory=dict)
 
     # --- thrust and battery ---
-    hover_thrust_estimate: HoverThrust = field(default_factory=HoverThrust)
+    hover_thrust_estimate: HoverThrustEstimate = field(default_factory=HoverThrustEstimate)
     #: thrust that the rotors produce, 0..65535; None before the first sample
-    rotor_thrust: float | None = None
+    lagged_rotor_raw_thrust: float | None = None
     #: time at which the reported thrust began to differ from the commanded one
     thrust_began_to_differ_from_command_at_s: float | None = None
-    #: last tick in which the two had differed for longer than `MAX_THRUST_REPORT_DELAY_S`
+    #: last tick in which the two had differed for longer than
+    #: `MAX_COMMAND_TO_REPORTED_THRUST_DELAY_S`
     thrust_last_differed_from_command_at_s: float = -math.inf
-    battery_fit: BatteryFit = field(default_factory=BatteryFit)  #: state of the battery fit
+    battery_fit: BatteryFitState = field(
+        default_factory=BatteryFitState
+    )  #: state of the battery fit
 
     @classmethod
     def initial_on_ground(cls, obs: Observation, profile: Profile) -> Belief:
@@ -234,7 +237,8 @@ class Belief:
         newest correction of the state estimate."""
         if self.profile.positioning.source.is_deck:
             return max(
-                self.obs.external_position_age_s, self.obs.imu.fusion_age.age_s(self.obs.t_s)
+                self.obs.external_position_age_s,
+                self.obs.imu.estimate_fusion_monitor.age_s(self.obs.t_s),
             )
         return self.obs.external_position_age_s
 
@@ -277,10 +281,10 @@ class Belief:
     def is_estimated_velocity_being_corrected(self) -> bool:
         """True while the newest external position still corrects the estimated velocity: it is
         older than the camera's latency by at most
-        `MAX_VELOCITY_CORRECTION_AGE_BEYOND_CAMERA_LATENCY_S`."""
+        `MAX_POSITION_AGE_BEYOND_LATENCY_TO_CORRECT_VELOCITY_S`."""
         return (
             self.position_correction_age_s
-            <= self.camera_latency_s + MAX_VELOCITY_CORRECTION_AGE_BEYOND_CAMERA_LATENCY_S
+            <= self.camera_latency_s + MAX_POSITION_AGE_BEYOND_LATENCY_TO_CORRECT_VELOCITY_S
         )
 
     @cached_property
@@ -296,8 +300,9 @@ class Belief:
         ):
             return False
         least_mps = (
-            MIN_SPEED_GAINED_IN_GUST_MPS
-            + GUST_SPEED_THRESHOLD_INCREASE_PER_LATENCY_SIGMA_MPS2 * self.obs.camera_latency_sigma_s
+            MIN_LATERAL_SPEED_GAIN_TO_DETECT_GUST_MPS
+            + GUST_DETECTION_THRESHOLD_INCREASE_PER_LATENCY_SIGMA_MPS2
+            * self.obs.camera_latency_sigma_s
         )
         return (
             math.hypot(*self.dead_reckoning.recent_imu_minus_estimate_velocity_world_xy_mps)
@@ -451,16 +456,17 @@ class Belief:
     @property
     def hover_thrust(self) -> float:
         """The estimated hover thrust, 0..65535; 0 while unknown."""
-        return self.hover_thrust_estimate.thrust
+        return self.hover_thrust_estimate.raw_thrust
 
     @cached_property
     def is_reported_thrust_reliable(self) -> bool:
         """True if the reported thrust can be used: no raw thrust is commanded, or the reported
-        thrust agrees with it or has differed from it for at most `MAX_THRUST_REPORT_DELAY_S`."""
+        thrust agrees with it or has differed from it for at most
+        `MAX_COMMAND_TO_REPORTED_THRUST_DELAY_S`."""
         return (
             self.thrust_began_to_differ_from_command_at_s is None
             or self.obs.t_s - self.thrust_began_to_differ_from_command_at_s
-            <= MAX_THRUST_REPORT_DELAY_S
+            <= MAX_COMMAND_TO_REPORTED_THRUST_DELAY_S
         )
 
     # --- The target ---
@@ -478,7 +484,10 @@ class Belief:
         world axes, estimated from pictures and tilt. None if the last pictures are too old or too
         few. Also None if the pictures contradict the vehicle's motion: the camera may then be
         rotated relative to the profile, and feedback of this velocity would not damp the motion."""
-        if self.mounting.is_camera_mounting_wrong or self.obs.camera_imu_mismatch is not None:
+        if (
+            self.camera_mounting_monitor.is_camera_mounting_wrong
+            or self.obs.camera_imu_mismatch is not None
+        ):
             return None
         return self.lateral_offset_filter.predict(self.obs.t_s)
 
@@ -504,7 +513,8 @@ class Belief:
                 self.obs.visual_inertial_motion is not None and self.obs.camera_imu_mismatch is None
             )
         return not (
-            self.mounting.is_target_motion_undetermined or self.mounting.is_camera_mounting_wrong
+            self.camera_mounting_monitor.is_target_motion_undetermined
+            or self.camera_mounting_monitor.is_camera_mounting_wrong
         )
 
     @property

@@ -14,9 +14,10 @@ against the target if it is at the target's height (`TARGET_CONTACT`), against a
 setpoint is above the vehicle (`CLIMB_BLOCKED`), and, if its position is unknown, against an unknown
 object (`IMU_SHOWS_SUPPORT`).
 `IMU_SHOWS_SUPPORT` also applies if the thrust is too small; its lower threshold is as far below
-hover thrust as the threshold for a press is above it. A change of `MIN_PRESS_TO_HOVER_THRUST_RATIO`
-therefore affects all of these conditions, and `Support.AIR`. `HANGING`, `MAGNET_HOLDS_VEHICLE` and
-`ON_FLOOR` require a thrust too small to support the vehicle (`is_thrust_too_low_to_fly`).
+hover thrust as the threshold for a press is above it. A change of
+`MIN_REPORTED_TO_HOVER_THRUST_RATIO_TO_DETECT_PRESS` therefore affects all of these conditions, and
+`Support.AIR`. `HANGING`, `MAGNET_HOLDS_VEHICLE` and `ON_FLOOR` require a thrust too small to
+support the vehicle (`is_thrust_too_low_to_fly`).
 
 `find_support` combines these conditions into one result: the vehicle is flying, pressing, hanging
 on the magnet, held by something else, or on the floor, or its support is unknown. `true_for_s`
@@ -31,59 +32,59 @@ from enum import Enum
 
 from perchctl.mission.belief.belief import Belief, GearToTargetDistance
 from perchctl.mission.belief.evidence import Condition, RequiredData
-from perchctl.mission.belief.thrust import MIN_FIRMWARE_POSITION_MODE_THRUST
+from perchctl.mission.belief.thrust import MIN_RAW_THRUST_IN_FIRMWARE_POSITION_MODE
 from perchctl.profile import Profile
 from perchctl.vehicle import FLYING, FULL_THRUST
 
 # --- thrust ---
-MIN_PRESS_TO_HOVER_THRUST_RATIO = 1.08
+MIN_REPORTED_TO_HOVER_THRUST_RATIO_TO_DETECT_PRESS = 1.08
 """Ratio of reported thrust to hover thrust at which a vehicle at rest counts as pressing: a margin
 of more than five standard deviations of the hover thrust learned in quiet flight. Larger: a weak
 press goes undetected. Smaller: a gust or a sagging battery looks like a press."""
-MIN_SATURATED_TO_FULL_THRUST_RATIO = 0.98
+MIN_FULL_THRUST_FRACTION_TO_COUNT_AS_SATURATED = 0.98
 """Fraction of full thrust above which the motors are saturated, so that the thrust no longer shows
 how much the vehicle needs."""
-MIN_NEARLY_FULL_THRUST_RATIO = 0.96
+MIN_FULL_THRUST_FRACTION_TO_COUNT_AS_NEARLY_FULL = 0.96
 """Fraction of full thrust that a sufficiently powerful vehicle needs only when it climbs. A vehicle
 with less than 4 % to spare sinks by half a metre after each interruption of its setpoints. Larger:
 such a vehicle goes on until it falls to the floor. Smaller: weak vehicles that can perch land."""
-MAX_RAW_THRUST = 60000.0
+MAX_RAW_THRUST_APPLIED_BY_FIRMWARE = 60000.0
 """Largest raw thrust that the firmware applies, 0..65535."""
-MIN_REPORTED_TO_COMMANDED_PRESS_THRUST_RATIO = 0.99
+MIN_REPORTED_TO_COMMANDED_THRUST_RATIO_TO_DETECT_PRESS = 0.99
 """Ratio of reported to commanded thrust at which a vehicle that presses by raw thrust always counts
 as pressing. Larger: a reading just below the commanded thrust goes undetected. Smaller: a heavy
 vehicle seems to be pressing while it is hovering."""
 MAX_HOVER_TO_FULL_THRUST_RATIO_TO_DETECT_PRESS = 0.93
 """Hover thrust, as a fraction of full thrust, above which too little thrust remains to prove a
 press. Smaller: a press is never detected on a heavy vehicle."""
-MAX_NON_LIFTING_TO_HOVER_THRUST_RATIO = 0.8
+MAX_HOVER_THRUST_FRACTION_TOO_LOW_TO_FLY = 0.8
 """Fraction of hover thrust up to which thrust cannot hold the vehicle in the air. With more thrust,
 the ground effect of the ceiling may hold it."""
 MAX_RAW_THRUST_WITH_MOTORS_STOPPED = 5000
 """Largest raw thrust, 0..65535, at which the motors do not turn."""
-MIN_POSSIBLE_HOVER_THRUST = 1000
+MIN_PLAUSIBLE_HOVER_RAW_THRUST = 1000
 """Smallest reported thrust, 0..65535, that may be hover thrust; the hover thrust of any vehicle is
 far larger."""
 
 # --- motion and position ---
-MAX_MOTIONLESS_CLIMB_RATE_MPS = 0.05
+MAX_CLIMB_RATE_TO_COUNT_AS_MOTIONLESS_MPS = 0.05
 """Vertical speed below which the vehicle counts as motionless, m/s. Larger: a slow descent looks
 like hanging."""
-MIN_CLIMB_RATE_AT_FULL_THRUST_MPS = 0.2
+MIN_CLIMB_RATE_EXPECTED_AT_FULL_THRUST_MPS = 0.2
 """Climb rate that any vehicle with enough thrust to hover soon exceeds at full thrust, m/s: at full
 thrust, the weakest vehicles that can perch take off at 0.3 to 0.5 m/s. Larger: such a vehicle lands
 at once. Smaller: a vehicle that only the ground effect lifts rises further before it sinks."""
-MAX_SPEED_TO_ACCEPT_HOVER_THRUST_MPS = 0.3
+MAX_SPEED_TO_COUNT_THRUST_AS_HOVER_MPS = 0.3
 """Largest speed at which the present thrust counts as hover thrust, m/s."""
-MAX_CLIMB_RATE_TO_ACCEPT_HOVER_THRUST_MPS = 0.27
+MAX_CLIMB_RATE_TO_COUNT_THRUST_AS_HOVER_MPS = 0.27
 """Largest vertical speed at which the present thrust counts as hover thrust, m/s."""
-MAX_SPECIFIC_FORCE_DEVIATION_TO_ACCEPT_HOVER_THRUST_G = 0.1
+MAX_SPECIFIC_FORCE_DEVIATION_TO_COUNT_THRUST_AS_HOVER_G = 0.1
 """Largest deviation of the specific force from 1 g at which the present thrust counts as hover
 thrust, g."""
-MAX_HEIGHT_DRIFT_RATE_IN_PRESS_MPS = 0.1
+MAX_ESTIMATED_HEIGHT_DRIFT_RATE_WHILE_PRESSED_MPS = 0.1
 """Rate at which a pressed vehicle's estimated height may drift, m/s. Larger: a contact far from the
 target is accepted. Smaller: a true contact is rejected if the last sighting is old."""
-MIN_SETPOINT_HEIGHT_ABOVE_VEHICLE_TO_PRESS_M = 0.08
+MIN_SETPOINT_HEIGHT_ABOVE_VEHICLE_TO_DETECT_PRESS_M = 0.08
 """Distance of the setpoint above a motionless vehicle beyond which the vehicle must be pressing
 against whatever blocks it, m. Larger: a blocked climb is detected late."""
 GEAR_DISPLACEMENT_BY_TOUCH_SIGMA_M = 0.001
@@ -92,30 +93,30 @@ LATERAL_SPEED_SIGMA_BEFORE_TOUCH_MPS = 0.02
 """Standard deviation of the lateral speed of a vehicle that is about to touch, m/s: twice that of a
 settled vehicle. Larger: the offset of a contact is reported as less precise than it is. Smaller: if
 the vehicle is pushed just before it touches, the offset is reported as more precise than it is."""
-DECK_POSITION_SIGMA_ADDED_BY_IMPACT_M = 0.002
+DECK_POSITION_SIGMA_ADDED_BY_CEILING_IMPACT_M = 0.002
 """Uncertainty that the impact on the ceiling adds to a position from a deck, m."""
-DECK_POSITION_SIGMA_GROWTH_MPS = 0.01
+DECK_POSITION_SIGMA_GROWTH_WITHOUT_SIGHTING_MPS = 0.01
 """Rate at which the uncertainty of a position from a deck grows without a sighting, m/s."""
-MAX_UPWARD_HEIGHT_DRIFT_DURING_SLIP_M = 0.02
+MAX_HEIGHT_ABOVE_LAST_CONTACT_TO_DETECT_SLIP_M = 0.02
 """Largest upward drift of the estimated height despite which a slip is still detected, m."""
-MIN_HEIGHT_LOSS_TO_ACCEPT_FLOOR_M = 0.1
+MIN_HEIGHT_LOSS_IN_DESCENT_TO_DETECT_FLOOR_M = 0.1
 """Height loss beyond which a descending vehicle counts as having come down, m."""
-MAX_HEIGHT_LOSS_IF_HELD_AT_DESCENT_START_M = 0.1
+MAX_HEIGHT_LOSS_TO_COUNT_AS_STILL_HANGING_M = 0.1
 """Height loss within which a descending vehicle may still be held where its descent began, m."""
-MAX_ESTIMATED_HEIGHT_ON_FLOOR_AFTER_DRIFT_M = 0.3
+MIN_ESTIMATED_HEIGHT_TO_COUNT_AS_HANGING_M = 0.3
 """Estimated height up to which a vehicle held at low thrust may be on the floor instead of hanging,
-m; allows for the drift of the height in flight. (`MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M` applies
-before take-off, when the height has not drifted yet.)"""
-MIN_HEIGHT_OF_BLOCKED_CLIMB_M = 0.15
+m; allows for the drift of the height in flight. (`MAX_HEIGHT_TO_COUNT_AS_STANDING_BEFORE_TAKEOFF_M`
+applies before take-off, when the height has not drifted yet.)"""
+MIN_HEIGHT_TO_DETECT_BLOCKED_CLIMB_M = 0.15
 """Height above which a blocked vehicle has left the ground, m."""
-MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M = 0.1
+MAX_HEIGHT_TO_COUNT_AS_STANDING_BEFORE_TAKEOFF_M = 0.1
 """Height below which a vehicle may still be on the ground instead of pressing, m."""
-MAX_GEAR_TO_TARGET_Z_WHEN_HANGING_M = 0.15
+MAX_GEAR_TO_TARGET_Z_TO_COUNT_AS_HANGING_M = 0.15
 """Largest height difference between gear and target, m, at which the vehicle may hang on its
 magnet."""
-MIN_GEAR_TO_TARGET_Z_WHEN_ON_FLOOR_M = 0.3
+MIN_GEAR_TO_TARGET_Z_TO_COUNT_AS_ON_FLOOR_M = 0.3
 """Smallest height difference between gear and target, m, of a vehicle that is on the floor."""
-MAX_CLIMB_RATE_IF_FALLING_IN_WEIGHT_TRANSFER_MPS = -0.05
+MAX_CLIMB_RATE_TO_DETECT_FALL_IN_WEIGHT_TRANSFER_MPS = -0.05
 """Climb rate below which a vehicle with a low specific force is falling, once the weight transfer
 by raw thrust has begun, m/s."""
 
@@ -159,7 +160,7 @@ def _gear_to_target_seen_in_contact(b: Belief) -> GearToTargetDistance | None:
         target is None
         or target.measured_gear_to_target_world_m is None
         or b.obs.camera_imu_mismatch is not None
-        or b.mounting.is_camera_mounting_wrong
+        or b.camera_mounting_monitor.is_camera_mounting_wrong
         or not _is_in_contact_with_target(b)
     ):
         return None
@@ -189,8 +190,8 @@ def _dead_reckoned_gear_to_target(b: Belief) -> GearToTargetDistance:
     if b.profile.positioning.source.is_deck and b.is_position_valid:
         sigma_m = math.hypot(
             sigma_m,
-            DECK_POSITION_SIGMA_ADDED_BY_IMPACT_M,
-            DECK_POSITION_SIGMA_GROWTH_MPS * b.sighting_age_s,
+            DECK_POSITION_SIGMA_ADDED_BY_CEILING_IMPACT_M,
+            DECK_POSITION_SIGMA_GROWTH_WITHOUT_SIGHTING_MPS * b.sighting_age_s,
         )
     return GearToTargetDistance(math.hypot(*dead_reckoning.gear_to_target_world_xy_m), sigma_m)
 
@@ -236,7 +237,7 @@ def contact_height_tolerance_m(b: Belief) -> float:
     """
     planner = b.profile.planner
     drift_mps = (
-        MAX_HEIGHT_DRIFT_RATE_IN_PRESS_MPS
+        MAX_ESTIMATED_HEIGHT_DRIFT_RATE_WHILE_PRESSED_MPS
         if b.is_target_position_source
         else planner.landing.drift_mps
     )
@@ -260,34 +261,39 @@ def is_gear_certainly_in_magnet_reach(b: Belief) -> bool:
 
 def max_press_thrust(profile: Profile) -> float:
     """Return the largest thrust that a press can reach, 0..65535: in a press by raw thrust, the
-    profile's `perch.thrust`, limited to `MAX_RAW_THRUST`; otherwise full thrust."""
+    profile's `perch.thrust`, limited to `MAX_RAW_THRUST_APPLIED_BY_FIRMWARE`; otherwise full
+    thrust."""
     perch = profile.planner.perch
-    return min(float(perch.thrust), MAX_RAW_THRUST) if perch.mode == "raw" else FULL_THRUST
+    return (
+        min(float(perch.thrust), MAX_RAW_THRUST_APPLIED_BY_FIRMWARE)
+        if perch.mode == "raw"
+        else FULL_THRUST
+    )
 
 
 def is_flying_at_hover_thrust(b: Belief) -> bool:
     """True if the vehicle flies so quietly that its present thrust is hover thrust: speed, climb
-    rate and specific force are within `MAX_SPEED_TO_ACCEPT_HOVER_THRUST_MPS`,
-    `MAX_CLIMB_RATE_TO_ACCEPT_HOVER_THRUST_MPS` and
-    `MAX_SPECIFIC_FORCE_DEVIATION_TO_ACCEPT_HOVER_THRUST_G` of those in hover, the motors are
+    rate and specific force are within `MAX_SPEED_TO_COUNT_THRUST_AS_HOVER_MPS`,
+    `MAX_CLIMB_RATE_TO_COUNT_THRUST_AS_HOVER_MPS` and
+    `MAX_SPECIFIC_FORCE_DEVIATION_TO_COUNT_THRUST_AS_HOVER_G` of those in hover, the motors are
     neither off nor saturated, and nothing blocks a climb. False without fresh telemetry or a valid
     position. The thrust is not compared with the estimated hover thrust."""
     tel, setpoint = b.telemetry, b.command_history.setpoint
     vz = tel.velocity_mps[2]
     stuck = (
         setpoint is not None
-        and setpoint.z_m - tel.position_m[2] > MIN_SETPOINT_HEIGHT_ABOVE_VEHICLE_TO_PRESS_M
-        and vz < MAX_MOTIONLESS_CLIMB_RATE_MPS
+        and setpoint.z_m - tel.position_m[2] > MIN_SETPOINT_HEIGHT_ABOVE_VEHICLE_TO_DETECT_PRESS_M
+        and vz < MAX_CLIMB_RATE_TO_COUNT_AS_MOTIONLESS_MPS
     )
     return (
         b.is_telemetry_fresh
         and b.is_position_valid
-        and MIN_POSSIBLE_HOVER_THRUST
+        and MIN_PLAUSIBLE_HOVER_RAW_THRUST
         <= tel.thrust
-        < MIN_SATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
-        and b.speed_mps < MAX_SPEED_TO_ACCEPT_HOVER_THRUST_MPS
-        and abs(vz) < MAX_CLIMB_RATE_TO_ACCEPT_HOVER_THRUST_MPS
-        and abs(tel.acc_z_g - 1.0) < MAX_SPECIFIC_FORCE_DEVIATION_TO_ACCEPT_HOVER_THRUST_G
+        < MIN_FULL_THRUST_FRACTION_TO_COUNT_AS_SATURATED * FULL_THRUST
+        and b.speed_mps < MAX_SPEED_TO_COUNT_THRUST_AS_HOVER_MPS
+        and abs(vz) < MAX_CLIMB_RATE_TO_COUNT_THRUST_AS_HOVER_MPS
+        and abs(tel.acc_z_g - 1.0) < MAX_SPECIFIC_FORCE_DEVIATION_TO_COUNT_THRUST_AS_HOVER_G
         and not stuck
     )
 
@@ -296,41 +302,46 @@ def is_thrust_too_low_to_fly(b: Belief) -> bool:
     """True if the reported thrust is too small to support the vehicle in the air.
 
     The limit is `complete.hold_ratio` times hover thrust. Position mode never commands less than
-    `MIN_FIRMWARE_POSITION_MODE_THRUST`, so that value is the limit if it is larger and still too
-    small to lift the vehicle. False while hover thrust is unknown or the reported thrust is not
+    `MIN_RAW_THRUST_IN_FIRMWARE_POSITION_MODE`, so that value is the limit if it is larger and still
+    too small to lift the vehicle. False while hover thrust is unknown or the reported thrust is not
     reliable.
     """
     most = b.profile.planner.complete.hold_ratio * b.hover_thrust
-    if MAX_NON_LIFTING_TO_HOVER_THRUST_RATIO * b.hover_thrust >= MIN_FIRMWARE_POSITION_MODE_THRUST:
-        most = max(most, MIN_FIRMWARE_POSITION_MODE_THRUST)
+    if (
+        MAX_HOVER_THRUST_FRACTION_TOO_LOW_TO_FLY * b.hover_thrust
+        >= MIN_RAW_THRUST_IN_FIRMWARE_POSITION_MODE
+    ):
+        most = max(most, MIN_RAW_THRUST_IN_FIRMWARE_POSITION_MODE)
     return b.is_reported_thrust_reliable and b.hover_thrust > 0 and b.telemetry.thrust <= most
 
 
 def is_thrust_above_hover(b: Belief) -> bool:
-    """True if the reported thrust is at least `MIN_PRESS_TO_HOVER_THRUST_RATIO` times hover thrust.
-    If the vehicle cannot produce that much, or hover thrust is unknown, a thrust close to the
-    largest possible one is enough: close to `max_press_thrust` during a press by raw thrust,
-    otherwise close to full thrust."""
-    most = MIN_SATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
+    """True if the reported thrust is at least `MIN_REPORTED_TO_HOVER_THRUST_RATIO_TO_DETECT_PRESS`
+    times hover thrust. If the vehicle cannot produce that much, or hover thrust is unknown, a
+    thrust close to the largest possible one is enough: close to `max_press_thrust` during a press
+    by raw thrust, otherwise close to full thrust."""
+    most = MIN_FULL_THRUST_FRACTION_TO_COUNT_AS_SATURATED * FULL_THRUST
     if (
         b.command_history.maneuver.presses_against_target
         and b.command_history.commanded_raw_thrust is not None
     ):
-        most = MIN_REPORTED_TO_COMMANDED_PRESS_THRUST_RATIO * max_press_thrust(b.profile)
+        most = MIN_REPORTED_TO_COMMANDED_THRUST_RATIO_TO_DETECT_PRESS * max_press_thrust(b.profile)
     least = (
-        min(MIN_PRESS_TO_HOVER_THRUST_RATIO * b.hover_thrust, most) if b.hover_thrust > 0 else most
+        min(MIN_REPORTED_TO_HOVER_THRUST_RATIO_TO_DETECT_PRESS * b.hover_thrust, most)
+        if b.hover_thrust > 0
+        else most
     )
     return b.telemetry.thrust >= least
 
 
 def is_pressing_against_surface(b: Belief) -> bool:
     """True if the thrust exceeds hover thrust (`is_thrust_above_hover`), the estimated vertical
-    speed is at most `MAX_MOTIONLESS_CLIMB_RATE_MPS` in either direction, and the vehicle is too
-    high to be on the ground."""
+    speed is at most `MAX_CLIMB_RATE_TO_COUNT_AS_MOTIONLESS_MPS` in either direction, and the
+    vehicle is too high to be on the ground."""
     return (
         is_thrust_above_hover(b)
-        and abs(b.telemetry.velocity_mps[2]) <= MAX_MOTIONLESS_CLIMB_RATE_MPS
-        and b.height_m >= MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M
+        and abs(b.telemetry.velocity_mps[2]) <= MAX_CLIMB_RATE_TO_COUNT_AS_MOTIONLESS_MPS
+        and b.height_m >= MAX_HEIGHT_TO_COUNT_AS_STANDING_BEFORE_TAKEOFF_M
     )
 
 
@@ -340,7 +351,7 @@ def is_pressing_against_surface(b: Belief) -> bool:
 def is_slipping_off_contact(b: Belief) -> bool:
     """True if the vehicle is sinking faster than `complete.slip_mps` after a contact, and either
     its estimated height is not above the height of the contact (within
-    `MAX_UPWARD_HEIGHT_DRIFT_DURING_SLIP_M`), or the accelerometer reads less than
+    `MAX_HEIGHT_ABOVE_LAST_CONTACT_TO_DETECT_SLIP_M`), or the accelerometer reads less than
     `complete.slip_acc_g`, or the position is not valid. False if no contact is recorded."""
     complete, tel = b.profile.planner.complete, b.telemetry
     if b.vehicle_world_z_at_last_contact_m is None or not b.is_sinking(complete.slip_mps):
@@ -348,7 +359,7 @@ def is_slipping_off_contact(b: Belief) -> bool:
     above_m = tel.position_m[2] - b.vehicle_world_z_at_last_contact_m
     return (
         not b.is_position_valid
-        or above_m < MAX_UPWARD_HEIGHT_DRIFT_DURING_SLIP_M
+        or above_m < MAX_HEIGHT_ABOVE_LAST_CONTACT_TO_DETECT_SLIP_M
         or tel.acc_z_g < complete.slip_acc_g
     )
 
@@ -356,9 +367,11 @@ def is_slipping_off_contact(b: Belief) -> bool:
 def is_vertically_motionless(b: Belief) -> bool:
     """True if the vehicle does not move vertically, as in hover or on a support: the accelerometer
     reads 1 g and, if the position is valid, the vertical speed is less than
-    `MAX_MOTIONLESS_CLIMB_RATE_MPS`. Without a valid position, a constant climb rate also counts."""
+    `MAX_CLIMB_RATE_TO_COUNT_AS_MOTIONLESS_MPS`. Without a valid position, a constant climb rate
+    also counts."""
     return b.is_accelerometer_reading_one_g and (
-        abs(b.telemetry.velocity_mps[2]) < MAX_MOTIONLESS_CLIMB_RATE_MPS or not b.is_position_valid
+        abs(b.telemetry.velocity_mps[2]) < MAX_CLIMB_RATE_TO_COUNT_AS_MOTIONLESS_MPS
+        or not b.is_position_valid
     )
 
 
@@ -372,13 +385,16 @@ def _is_in_contact_with_target(b: Belief) -> bool:
     The lateral distance from the target is not checked.
     """
     perch, tel = b.profile.planner.perch, b.telemetry
-    steady = abs(tel.velocity_mps[2]) <= MAX_MOTIONLESS_CLIMB_RATE_MPS and b.is_position_valid
+    steady = (
+        abs(tel.velocity_mps[2]) <= MAX_CLIMB_RATE_TO_COUNT_AS_MOTIONLESS_MPS
+        and b.is_position_valid
+    )
     motionless_s = b.obs.t_s - b.imu.climb_rate_became_steady_at_s
     return (
         abs(b.target.gear_to_target_z_m)
         <= perch.contact_z_m
         + (
-            MAX_HEIGHT_DRIFT_RATE_IN_PRESS_MPS * b.sighting_age_s
+            MAX_ESTIMATED_HEIGHT_DRIFT_RATE_WHILE_PRESSED_MPS * b.sighting_age_s
             if b.is_target_position_source
             else 0
         )
@@ -426,7 +442,7 @@ def _is_hanging(b: Belief) -> bool:
         return is_thrust_too_low_to_fly(b) and is_vertically_motionless(b)
     held = (
         is_thrust_too_low_to_fly(b)
-        and b.height_m > MAX_ESTIMATED_HEIGHT_ON_FLOOR_AFTER_DRIFT_M
+        and b.height_m > MIN_ESTIMATED_HEIGHT_TO_COUNT_AS_HANGING_M
         and is_vertically_motionless(b)
     )
     if not b.command_history.maneuver.descends_to_floor:
@@ -437,11 +453,11 @@ def _is_hanging(b: Belief) -> bool:
     )
     at_target = (
         b.obs.target is not None
-        and abs(b.target.gear_to_target_z_m) <= MAX_GEAR_TO_TARGET_Z_WHEN_HANGING_M
+        and abs(b.target.gear_to_target_z_m) <= MAX_GEAR_TO_TARGET_Z_TO_COUNT_AS_HANGING_M
     )
     stayed = (
         b.command_history.maneuver_start_position_m[2] - tel.position_m[2]
-        < MAX_HEIGHT_LOSS_IF_HELD_AT_DESCENT_START_M
+        < MAX_HEIGHT_LOSS_TO_COUNT_AS_STILL_HANGING_M
         and not b.target.is_too_far_above_to_hold_vehicle
     )
     return held and (at_contact or at_target or stayed)
@@ -478,12 +494,12 @@ def _is_on_floor(b: Belief) -> bool:
     may have drifted."""
     near_target = (
         b.obs.target is not None
-        and abs(b.target.gear_to_target_z_m) <= MIN_GEAR_TO_TARGET_Z_WHEN_ON_FLOOR_M
+        and abs(b.target.gear_to_target_z_m) <= MIN_GEAR_TO_TARGET_Z_TO_COUNT_AS_ON_FLOOR_M
     )
     came_down_m = b.command_history.maneuver_start_position_m[2] - b.telemetry.position_m[2]
     came_down = (
         b.command_history.maneuver.descends_to_floor
-        and came_down_m > MIN_HEIGHT_LOSS_TO_ACCEPT_FLOOR_M
+        and came_down_m > MIN_HEIGHT_LOSS_IN_DESCENT_TO_DETECT_FLOOR_M
     )
     handover_m = b.profile.planner.landing.handover_m
     low = b.height_m < handover_m or (came_down and b.vehicle_world_z_at_last_contact_m is None)
@@ -492,20 +508,23 @@ def _is_on_floor(b: Belief) -> bool:
 
 def _is_pressing_against_obstacle(b: Belief) -> bool:
     """True if something blocks the vehicle's climb: the setpoint is above the vehicle, the thrust
-    exceeds hover thrust, the vehicle is above `MIN_HEIGHT_OF_BLOCKED_CLIMB_M`, and it does not move
-    vertically. False for a vehicle so heavy that too little thrust remains to prove a press
-    (`MAX_HOVER_TO_FULL_THRUST_RATIO_TO_DETECT_PRESS`). The target also counts as an obstacle."""
+    exceeds hover thrust, the vehicle is above `MIN_HEIGHT_TO_DETECT_BLOCKED_CLIMB_M`, and it does
+    not move vertically. False for a vehicle so heavy that too little thrust remains to prove a
+    press (`MAX_HOVER_TO_FULL_THRUST_RATIO_TO_DETECT_PRESS`). The target also counts as an
+    obstacle."""
     setpoint, tel = b.command_history.setpoint, b.telemetry
     if (
         setpoint is None
-        or setpoint.z_m - tel.position_m[2] < MIN_SETPOINT_HEIGHT_ABOVE_VEHICLE_TO_PRESS_M
+        or setpoint.z_m - tel.position_m[2] < MIN_SETPOINT_HEIGHT_ABOVE_VEHICLE_TO_DETECT_PRESS_M
     ):
         return False
     strong = (
         b.hover_thrust < MAX_HOVER_TO_FULL_THRUST_RATIO_TO_DETECT_PRESS * FULL_THRUST
         and is_thrust_above_hover(b)
     )
-    return strong and b.height_m > MIN_HEIGHT_OF_BLOCKED_CLIMB_M and is_vertically_motionless(b)
+    return (
+        strong and b.height_m > MIN_HEIGHT_TO_DETECT_BLOCKED_CLIMB_M and is_vertically_motionless(b)
+    )
 
 
 def _does_imu_show_support(b: Belief) -> bool:
@@ -513,8 +532,8 @@ def _does_imu_show_support(b: Belief) -> bool:
     it is pressing against something.
 
     The thrust is above or below hover thrust by at least the margin in
-    `MIN_PRESS_TO_HOVER_THRUST_RATIO`, which would accelerate a vehicle in the air. Nevertheless,
-    the accelerometer reads 1 g and the vertical speed stays constant.
+    `MIN_REPORTED_TO_HOVER_THRUST_RATIO_TO_DETECT_PRESS`, which would accelerate a vehicle in the
+    air. Nevertheless, the accelerometer reads 1 g and the vertical speed stays constant.
     """
     tel, perch, hover = b.telemetry, b.profile.planner.perch, b.hover_thrust
     return (
@@ -522,7 +541,7 @@ def _does_imu_show_support(b: Belief) -> bool:
         and b.is_reported_thrust_reliable
         and (
             is_thrust_above_hover(b)
-            or tel.thrust <= (2.0 - MIN_PRESS_TO_HOVER_THRUST_RATIO) * hover
+            or tel.thrust <= (2.0 - MIN_REPORTED_TO_HOVER_THRUST_RATIO_TO_DETECT_PRESS) * hover
         )
         and b.is_accelerometer_reading_one_g
         and b.obs.t_s - b.imu.climb_rate_became_steady_at_s >= perch.contact_dwell_s
@@ -530,15 +549,15 @@ def _does_imu_show_support(b: Belief) -> bool:
 
 
 def _is_not_climbing_at_full_thrust(b: Belief) -> bool:
-    full = b.telemetry.thrust >= MIN_SATURATED_TO_FULL_THRUST_RATIO * FULL_THRUST
+    full = b.telemetry.thrust >= MIN_FULL_THRUST_FRACTION_TO_COUNT_AS_SATURATED * FULL_THRUST
     flies = b.command_history.maneuver.is_in_free_air
-    return flies and full and b.climb_mps < MAX_MOTIONLESS_CLIMB_RATE_MPS
+    return flies and full and b.climb_mps < MAX_CLIMB_RATE_TO_COUNT_AS_MOTIONLESS_MPS
 
 
 def _is_climbing_slowly_at_nearly_full_thrust(b: Belief) -> bool:
-    full = b.telemetry.thrust >= MIN_NEARLY_FULL_THRUST_RATIO * FULL_THRUST
+    full = b.telemetry.thrust >= MIN_FULL_THRUST_FRACTION_TO_COUNT_AS_NEARLY_FULL * FULL_THRUST
     flies = b.command_history.maneuver.is_in_free_air
-    return flies and full and b.climb_mps < MIN_CLIMB_RATE_AT_FULL_THRUST_MPS
+    return flies and full and b.climb_mps < MIN_CLIMB_RATE_EXPECTED_AT_FULL_THRUST_MPS
 
 
 TARGET_CONTACT = Condition(
@@ -705,12 +724,16 @@ def has_slipped_off_contact(b: Belief) -> bool:
     `complete.slip_dwell_s`. Once the weight transfer has begun, which reduces raw thrust until the
     support carries the whole weight, one tick is enough in which fresh telemetry shows a specific
     force below `complete.slip_acc_g` and a climb rate below
-    `MAX_CLIMB_RATE_IF_FALLING_IN_WEIGHT_TRANSFER_MPS`."""
+    `MAX_CLIMB_RATE_TO_DETECT_FALL_IN_WEIGHT_TRANSFER_MPS`."""
     tel, complete = b.telemetry, b.profile.planner.complete
     falls = (
         b.command_history.weight_transfer_began_at_s is not None
         and tel.acc_z_g < complete.slip_acc_g
     )
-    if falls and b.is_imu_fresh and b.climb_mps < MAX_CLIMB_RATE_IF_FALLING_IN_WEIGHT_TRANSFER_MPS:
+    if (
+        falls
+        and b.is_imu_fresh
+        and b.climb_mps < MAX_CLIMB_RATE_TO_DETECT_FALL_IN_WEIGHT_TRANSFER_MPS
+    ):
         return True
     return b.true_for_s(SLIPPING_OFF_CONTACT) >= complete.slip_dwell_s

@@ -24,10 +24,10 @@ from perchctl.values import replace
 
 LateralVector = tuple[float, float]
 
-ACCELERATION_NOISE_SIGMA_MPS2 = 0.15
+ACCELERATION_PROCESS_NOISE_SIGMA_MPS2 = 0.15
 """Standard deviation of the acceleration that the tilt does not explain, m/s^2. Larger: the
 velocity follows the noise of single pictures. Smaller: after a gust, the offset lags behind."""
-ACCELERATION_NOISE_CORRELATION_TIME_S = 0.1
+ACCELERATION_PROCESS_NOISE_CORRELATION_TIME_S = 0.1
 """Correlation time of the acceleration that the tilt does not explain, s. A larger value has the
 same effect as a larger standard deviation."""
 MIN_MEASURED_OFFSET_SIGMA_M = 0.0005
@@ -35,12 +35,12 @@ MIN_MEASURED_OFFSET_SIGMA_M = 0.0005
 not exact either. Smaller: the velocity follows their errors."""
 INITIAL_VELOCITY_SIGMA_MPS = 0.3
 """Standard deviation of the unknown velocity at the first picture, m/s."""
-ESTIMATED_VELOCITY_SIGMA_MPS = 0.04
+ESTIMATED_VELOCITY_MEASUREMENT_SIGMA_MPS = 0.04
 """Standard deviation of the estimated velocity, m/s, with the errors of the samples treated as
 independent; the error of a Flow deck is 8 mm/s, but lasts for a tenth of a second. Larger: an
 acceleration that the tilt does not explain is noticed one picture later. Smaller: the error of the
 estimate moves the vehicle."""
-MAX_AGE_OF_NEWEST_PICTURE_S = 0.5
+MAX_FILTER_PREDICTION_TIME_WITHOUT_PICTURE_S = 0.5
 """Longest time between two pictures, and from the newest picture to a prediction, s. Larger: a gust
 moves the vehicle unnoticed. Smaller: the vehicle flies the last centimetres with the state estimate
 instead of this filter."""
@@ -48,7 +48,7 @@ MIN_NIS_TO_RESTART_FILTER = 20.0
 """Normalized innovation squared (two degrees of freedom) above which a picture restarts the filter;
 by chance, one in 20,000 pictures exceeds it. Larger: after a jump of the pose, the velocity is
 wrong."""
-MAX_VELOCITY_SIGMA_TO_PREDICT_MPS = 0.03
+MAX_VELOCITY_SIGMA_TO_USE_FILTER_MPS = 0.03
 """Largest standard deviation of the filter's velocity at which the filter is used, m/s; above it,
 `predict` returns None. Larger: the noise of the first pictures steers the vehicle."""
 
@@ -109,7 +109,10 @@ class LateralOffsetFilter:
         if kept and sample.t_s <= kept[-1].t_s:
             return self
         first = 0
-        while first < len(kept) and kept[first].t_s < sample.t_s - MAX_AGE_OF_NEWEST_PICTURE_S:
+        while (
+            first < len(kept)
+            and kept[first].t_s < sample.t_s - MAX_FILTER_PREDICTION_TIME_WITHOUT_PICTURE_S
+        ):
             first += 1
         return replace(self, samples=(*kept[first:], sample))
 
@@ -121,14 +124,14 @@ class LateralOffsetFilter:
         per axis.
 
         A picture that is not newer than the last one changes nothing. After a gap of more than
-        `MAX_AGE_OF_NEWEST_PICTURE_S`, or if the normalized innovation squared exceeds
-        `MIN_NIS_TO_RESTART_FILTER`, the filter restarts at the measured vector with unknown
+        `MAX_FILTER_PREDICTION_TIME_WITHOUT_PICTURE_S`, or if the normalized innovation squared
+        exceeds `MIN_NIS_TO_RESTART_FILTER`, the filter restarts at the measured vector with unknown
         velocity.
         """
         if t_s <= self.t_s:
             return self
         variance_m2 = max(sigma_m, MIN_MEASURED_OFFSET_SIGMA_M) ** 2
-        if t_s - self.t_s > MAX_AGE_OF_NEWEST_PICTURE_S:
+        if t_s - self.t_s > MAX_FILTER_PREDICTION_TIME_WITHOUT_PICTURE_S:
             return self._restart(t_s, gear_to_target_world_xy_m, variance_m2)
         predicted = self._propagate_through_samples(t_s)
         p_ee, p_ev, p_vv = predicted.covariance
@@ -155,11 +158,14 @@ class LateralOffsetFilter:
 
     def predict(self, t_s: float) -> LateralOffsetAndVelocity | None:
         """Return the estimate at `t_s`; None if the newest picture is older than
-        `MAX_AGE_OF_NEWEST_PICTURE_S`, or while the velocity is less certain than
-        `MAX_VELOCITY_SIGMA_TO_PREDICT_MPS`."""
-        if not 0.0 <= t_s - self.t_s <= MAX_AGE_OF_NEWEST_PICTURE_S:
+        `MAX_FILTER_PREDICTION_TIME_WITHOUT_PICTURE_S`, or while the velocity is less certain than
+        `MAX_VELOCITY_SIGMA_TO_USE_FILTER_MPS`."""
+        if not 0.0 <= t_s - self.t_s <= MAX_FILTER_PREDICTION_TIME_WITHOUT_PICTURE_S:
             return None
-        if math.sqrt(self.covariance.velocity_variance_m2ps2) > MAX_VELOCITY_SIGMA_TO_PREDICT_MPS:
+        if (
+            math.sqrt(self.covariance.velocity_variance_m2ps2)
+            > MAX_VELOCITY_SIGMA_TO_USE_FILTER_MPS
+        ):
             return None
         predicted = self._propagate_through_samples(t_s)
         p_ee, _, p_vv = predicted.covariance
@@ -213,7 +219,9 @@ class LateralOffsetFilter:
         accelerated at the constant `acceleration_mps2` (world x and y) since then. The vector from
         the gear to the target changes by minus the vehicle's motion."""
         dt_s = t_s - self.t_s
-        density = ACCELERATION_NOISE_SIGMA_MPS2**2 * ACCELERATION_NOISE_CORRELATION_TIME_S
+        density = (
+            ACCELERATION_PROCESS_NOISE_SIGMA_MPS2**2 * ACCELERATION_PROCESS_NOISE_CORRELATION_TIME_S
+        )
         p_ee, p_ev, p_vv = self.covariance
         moved_m = _add_scaled(
             self.gear_to_target_world_xy_m, -dt_s, self.vehicle_velocity_world_xy_mps
@@ -237,9 +245,9 @@ class LateralOffsetFilter:
     ) -> LateralOffsetFilter:
         """Return the filter after a Kalman update, at its own time `t_s`, with the vehicle's
         velocity from the state estimate (world x and y), which has the standard deviation
-        `ESTIMATED_VELOCITY_SIGMA_MPS` per axis."""
+        `ESTIMATED_VELOCITY_MEASUREMENT_SIGMA_MPS` per axis."""
         p_ee, p_ev, p_vv = self.covariance
-        variance = p_vv + ESTIMATED_VELOCITY_SIGMA_MPS**2
+        variance = p_vv + ESTIMATED_VELOCITY_MEASUREMENT_SIGMA_MPS**2
         gain_e, gain_v = p_ev / variance, p_vv / variance
         innovation_mps = _add_scaled(
             estimated_velocity_world_xy_mps, -1.0, self.vehicle_velocity_world_xy_mps

@@ -20,40 +20,48 @@ from perchctl.vehicle import Telemetry
 CAMERA_MOUNTING_CHECK_WINDOW_S = 3.0  # older sightings are dropped because the estimate drifts
 MIN_SIGHTINGS_TO_JUDGE_CAMERA_MOUNTING = 10
 """Number of sightings required to judge the mounting."""
-MIN_UP_AXIS_MOTION_TO_JUDGE_MOUNTING_M, MIN_UP_AXIS_MOTION_TO_CONFIRM_MOUNTING_M = 0.12, 0.3
+MIN_VEHICLE_UP_AXIS_MOTION_TO_JUDGE_MOUNTING_M, MIN_VEHICLE_UP_AXIS_MOTION_TO_CONFIRM_MOUNTING_M = (
+    0.12,
+    0.3,
+)
 """Motion of the vehicle's upward axis, m, above which the mounting is judged, and above which it is
 proven."""
-MAX_TARGET_TO_UP_AXIS_MOTION_RATIO_IF_STATIONARY, MIN_TARGET_TO_UP_AXIS_MOTION_RATIO_IF_MOVING = (
+(
+    MAX_APPARENT_TARGET_TO_VEHICLE_MOTION_RATIO_IF_MOUNTING_RIGHT,
+    MIN_APPARENT_TARGET_TO_VEHICLE_MOTION_RATIO_IF_MOUNTING_WRONG,
+) = (
     0.35,
     0.6,
 )
 """Ratio of the target's apparent motion to the vehicle's motion: below the first value, the target
 is stationary; above the second, it moves with the vehicle. Undisturbed flights show 0.25 at most; a
 camera rotated by a quarter turn shows 1.4."""
-MIN_MOVING_TARGET_POSITION_RMS_M = 0.05
+MIN_TARGET_POSITION_RMS_TO_JUDGE_MOUNTING_WRONG_M = 0.05
 """Smallest RMS distance of the target's estimated world positions from their mean that shows that
 the target moves, m."""
-MAX_ROTATION_FIT_RESIDUAL_TO_SPREAD_RATIO = 0.45  # fraction of the target's spread
-MIN_MODULUS_OF_FITTED_COMPLEX_ROTATION = 0.5  # modulus of M; near 0, the world frame drifts
+MAX_ROTATION_FIT_RESIDUAL_TO_TARGET_SPREAD_RATIO = 0.45  # fraction of the target's spread
+MIN_FITTED_ROTATION_MODULUS_TO_JUDGE_MOUNTING_WRONG = (
+    0.5  # modulus of M; near 0, the world frame drifts
+)
 # with a smaller rotation, the vehicle still reaches the target on a curve
-MIN_DETECTED_CAMERA_YAW_ERROR_RAD = math.radians(65.0)
-MIN_CONTRADICTING_SIGHTINGS = 4
+MIN_CAMERA_YAW_ERROR_TO_JUDGE_MOUNTING_WRONG_RAD = math.radians(65.0)
+MIN_CONTRADICTING_SIGHTINGS_TO_JUDGE_MOUNTING_WRONG = 4
 """Number of successive contradicting sightings that prove a wrong mounting. Smaller: single wrong
 poses end the flight."""
-TARGET_JUMP_MIN_DISTANCE_M_MAX_DURATION_S_PAIRS, CHECK_PAUSE_AFTER_JUMP_S = (
+TARGET_JUMP_MIN_DISTANCE_M_MAX_DURATION_S_PAIRS, MOUNTING_CHECK_PAUSE_AFTER_JUMP_S = (
     ((0.1, 0.1), (0.15, 0.2)),
     0.4,
 )
 """`TARGET_JUMP_MIN_DISTANCE_M_MAX_DURATION_S_PAIRS` are pairs of a distance, m, and a time, s: a
 target that moves by more than the distance plus twice the vehicle's motion within that time has
-been moved. `CHECK_PAUSE_AFTER_JUMP_S` is the pause of the check after a jump, s."""
-MIN_ESTIMATE_JUMP_DISTANCE_M = 0.05
+been moved. `MOUNTING_CHECK_PAUSE_AFTER_JUMP_S` is the pause of the check after a jump, s."""
+MIN_POSITION_CHANGE_TO_DETECT_ESTIMATE_JUMP_M = 0.05
 """Motion of the vehicle's estimated position between two sightings above which the state estimate
 has jumped, m; `ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS` times the time between them is added. Larger:
 sightings from before and after a jump are compared."""
 ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS = 1.5
-"""Increase of `MIN_ESTIMATE_JUMP_DISTANCE_M` for each second between the sightings, m/s. Smaller:
-the sightings of a fast vehicle are dropped."""
+"""Increase of `MIN_POSITION_CHANGE_TO_DETECT_ESTIMATE_JUMP_M` for each second between the
+sightings, m/s. Smaller: the sightings of a fast vehicle are dropped."""
 _MAX_TARGET_JUMP_DURATION_S = max(
     within_s for _, within_s in TARGET_JUMP_MIN_DISTANCE_M_MAX_DURATION_S_PAIRS
 )
@@ -110,7 +118,8 @@ class CameraMountingMonitor:
         sightings: one sample for each frame that measured the target, oldest first.
         check_paused_until_s: loop time until which new sightings are ignored after a jump.
         is_camera_mounting_confirmed: the target stayed in place while the vehicle's upward axis
-            moved by at least `MIN_UP_AXIS_MOTION_TO_CONFIRM_MOUNTING_M`; the check is complete.
+            moved by at least `MIN_VEHICLE_UP_AXIS_MOTION_TO_CONFIRM_MOUNTING_M`; the check is
+            complete.
         is_target_stationary: the present sightings show a stationary target.
         contradicting_sighting_count: number of successive sightings, up to the newest one, that
             contradict the mounting.
@@ -121,8 +130,8 @@ class CameraMountingMonitor:
 
     sightings: tuple[CameraMountingSample, ...] = ()
     check_paused_until_s: float = -math.inf
-    # the target was stationary while the vehicle moved `MIN_UP_AXIS_MOTION_TO_CONFIRM_MOUNTING_M`:
-    # the check is complete
+    # the target was stationary while the vehicle moved
+    # `MIN_VEHICLE_UP_AXIS_MOTION_TO_CONFIRM_MOUNTING_M`: the check is complete
     is_camera_mounting_confirmed: bool = False
     is_target_stationary: bool = False  # the target has been stationary so far
     contradicting_sighting_count: int = 0  # successive sightings that contradict the mounting
@@ -131,8 +140,11 @@ class CameraMountingMonitor:
 
     @property
     def is_camera_mounting_wrong(self) -> bool:
-        """True once `MIN_CONTRADICTING_SIGHTINGS` successive sightings contradict the mounting."""
-        return self.contradicting_sighting_count >= MIN_CONTRADICTING_SIGHTINGS
+        """True once `MIN_CONTRADICTING_SIGHTINGS_TO_JUDGE_MOUNTING_WRONG` successive sightings
+        contradict the mounting."""
+        return (
+            self.contradicting_sighting_count >= MIN_CONTRADICTING_SIGHTINGS_TO_JUDGE_MOUNTING_WRONG
+        )
 
     @property
     def is_target_motion_undetermined(self) -> bool:
@@ -156,13 +168,16 @@ def update_camera_mounting_monitor(
 
     Once the mounting is confirmed or found wrong, nothing changes any more. After a jump of the
     target or of the state estimate, the check starts again and pauses for
-    `CHECK_PAUSE_AFTER_JUMP_S`. Sightings older than `CAMERA_MOUNTING_CHECK_WINDOW_S` are dropped.
+    `MOUNTING_CHECK_PAUSE_AFTER_JUMP_S`. Sightings older than `CAMERA_MOUNTING_CHECK_WINDOW_S` are
+    dropped.
     """
     if old.is_camera_mounting_confirmed or old.is_camera_mounting_wrong:
         return old
     kept = tuple(s for s in old.sightings if sample.t_s - s.t_s <= CAMERA_MOUNTING_CHECK_WINDOW_S)
     if kept and _has_target_or_estimate_jumped(kept, sample):
-        return CameraMountingMonitor(check_paused_until_s=sample.t_s + CHECK_PAUSE_AFTER_JUMP_S)
+        return CameraMountingMonitor(
+            check_paused_until_s=sample.t_s + MOUNTING_CHECK_PAUSE_AFTER_JUMP_S
+        )
     if sample.t_s < old.check_paused_until_s:
         return old
     new = replace(
@@ -181,7 +196,7 @@ def _has_target_or_estimate_jumped(
     """True if, since one of `earlier_samples` (oldest first), the vehicle's estimated position has
     moved too far for a flight, or the target too far for the vehicle's motion to explain it."""
     last = earlier_samples[-1]
-    far = MIN_ESTIMATE_JUMP_DISTANCE_M + ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS * (
+    far = MIN_POSITION_CHANGE_TO_DETECT_ESTIMATE_JUMP_M + ESTIMATE_JUMP_THRESHOLD_GROWTH_MPS * (
         sample.t_s - last.t_s
     )
     if abs(sample.vehicle_world_xy_m - last.vehicle_world_xy_m) > far:
@@ -218,26 +233,27 @@ def _judge_camera_mounting(
     )
     n, first = len(aims), aims[0]
     moved_m = max(abs(aim - first) for aim in aims)
-    if moved_m < MIN_UP_AXIS_MOTION_TO_JUDGE_MOUNTING_M:
+    if moved_m < MIN_VEHICLE_UP_AXIS_MOTION_TO_JUDGE_MOUNTING_M:
         return monitor
     p0, q0 = sum(aims) / n, sum(targets) / n
     pairs = [(aim - p0, target - q0) for aim, target in zip(aims, targets, strict=True)]
     along = sum(p.conjugate() * q for p, q in pairs) / sum(abs(p) ** 2 for p, _ in pairs)
-    if abs(along) < MAX_TARGET_TO_UP_AXIS_MOTION_RATIO_IF_STATIONARY:
+    if abs(along) < MAX_APPARENT_TARGET_TO_VEHICLE_MOTION_RATIO_IF_MOUNTING_RIGHT:
         return replace(
             monitor,
-            is_camera_mounting_confirmed=moved_m >= MIN_UP_AXIS_MOTION_TO_CONFIRM_MOUNTING_M,
+            is_camera_mounting_confirmed=moved_m
+            >= MIN_VEHICLE_UP_AXIS_MOTION_TO_CONFIRM_MOUNTING_M,
             is_target_stationary=True,
         )
     spread_m = math.sqrt(sum(abs(q) ** 2 for _, q in pairs) / n)
     unexplained_m = math.sqrt(sum(abs(q - along * p) ** 2 for p, q in pairs) / n)
     turn = 1.0 - along
     if (
-        abs(along) >= MIN_TARGET_TO_UP_AXIS_MOTION_RATIO_IF_MOVING
-        and abs(turn) >= MIN_MODULUS_OF_FITTED_COMPLEX_ROTATION
-        and abs(cmath.phase(turn)) >= MIN_DETECTED_CAMERA_YAW_ERROR_RAD
-        and spread_m >= MIN_MOVING_TARGET_POSITION_RMS_M
-        and unexplained_m <= MAX_ROTATION_FIT_RESIDUAL_TO_SPREAD_RATIO * spread_m
+        abs(along) >= MIN_APPARENT_TARGET_TO_VEHICLE_MOTION_RATIO_IF_MOUNTING_WRONG
+        and abs(turn) >= MIN_FITTED_ROTATION_MODULUS_TO_JUDGE_MOUNTING_WRONG
+        and abs(cmath.phase(turn)) >= MIN_CAMERA_YAW_ERROR_TO_JUDGE_MOUNTING_WRONG_RAD
+        and spread_m >= MIN_TARGET_POSITION_RMS_TO_JUDGE_MOUNTING_WRONG_M
+        and unexplained_m <= MAX_ROTATION_FIT_RESIDUAL_TO_TARGET_SPREAD_RATIO * spread_m
     ):
         return replace(
             monitor,

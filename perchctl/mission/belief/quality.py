@@ -13,7 +13,7 @@ from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V
 MAX_LATERAL_SPEED_FROM_DRAUGHT_MPS = 0.5
 """Lateral speed that no draught can cause, m/s. Larger: an impact during the press is noticed
 late."""
-MAX_RECENT_ESTIMATE_MINUS_IMU_VELOCITY_MPS = 0.15
+MAX_ESTIMATE_MINUS_IMU_VELOCITY_TO_TRUST_POSITIONS_MPS = 0.15
 """Largest lateral velocity that the estimate may gain without the accelerometer, m/s; correct
 positions cause at most 0.07. Larger: positions in the wrong axes displace the vehicle further
 before they are noticed."""
@@ -26,14 +26,14 @@ NO_ESTIMATE_CORRECTION_TEXT = (
 
 def _does_estimate_contradict_imu(b: Belief) -> bool:
     """True if, with motion capture, the state estimate has recently gained more than
-    `MAX_RECENT_ESTIMATE_MINUS_IMU_VELOCITY_MPS` of lateral velocity that the accelerometer has not
-    measured: the positions are then in the wrong axes. Always False with another position
-    source."""
+    `MAX_ESTIMATE_MINUS_IMU_VELOCITY_TO_TRUST_POSITIONS_MPS` of lateral velocity that the
+    accelerometer has not measured: the positions are then in the wrong axes. Always False with
+    another position source."""
     by_capture = b.profile.positioning.source.is_mocap
     return (
         by_capture
         and math.hypot(*b.dead_reckoning.recent_estimate_minus_imu_velocity_world_xy_mps)
-        > MAX_RECENT_ESTIMATE_MINUS_IMU_VELOCITY_MPS
+        > MAX_ESTIMATE_MINUS_IMU_VELOCITY_TO_TRUST_POSITIONS_MPS
     )
 
 

@@ -4,8 +4,8 @@ While positions correct the state estimate, the reckoned velocity v is pulled to
 velocity e, and the bias b (the error of accelerometer and attitude) is learned from the difference:
 
     v += (dv_imu - b dt)                                               each sample
-    v += (e - v) dt / VELOCITY_CORRECTION_BY_ESTIMATE_TIME_CONSTANT_S  while e is trusted
-    b += (dv_imu - de - b dt) / ACCELERATION_BIAS_TIME_CONSTANT_S      while e is trusted
+    v += (e - v) dt / DEAD_RECKONED_VELOCITY_CORRECTION_TIME_CONSTANT_S  while e is trusted
+    b += (dv_imu - de - b dt) / ACCELERATION_BIAS_LEARNING_TIME_CONSTANT_S      while e is trusted
 
 Without positions, only the first line applies. The gear's offset from the target is integrated with
 v from the last sighting; its standard deviation grows with the time since then and with the
@@ -22,9 +22,9 @@ from dataclasses import dataclass
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission.belief.motion import (
     ACCELEROMETER_OFFSET_TIME_CONSTANT_S,
-    MAX_FROZEN_READING_DURATION_S,
+    MAX_FROZEN_READING_DURATION_TO_TRUST_SAMPLE_S,
     MAX_PUSH_TO_ESTIMATE_RESPONSE_DELAY_S,
-    MAX_TELEMETRY_GAP_S,
+    MAX_SAMPLE_INTERVAL_WITHOUT_TELEMETRY_GAP_S,
     ZERO_VECTOR,
     ImuMotion,
     Vector,
@@ -32,28 +32,28 @@ from perchctl.mission.belief.motion import (
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
-VELOCITY_CORRECTION_BY_ESTIMATE_TIME_CONSTANT_S = 3.0
+DEAD_RECKONED_VELOCITY_CORRECTION_TIME_CONSTANT_S = 3.0
 """Time constant with which the reckoned velocity approaches a trusted estimate, s. Larger: an old
 error of the reckoned velocity persists. Smaller: a wrong estimate is followed."""
-ACCELERATION_BIAS_TIME_CONSTANT_S = 4.0
+ACCELERATION_BIAS_LEARNING_TIME_CONSTANT_S = 4.0
 """Time constant with which the bias is learned, s. Larger: the bias adapts too slowly to a change
 in the wind. Smaller: a gust is learned as a bias."""
-MAX_ACCELERATION_BIAS_MPS2 = 1.5
+MAX_LEARNED_ACCELERATION_BIAS_MPS2 = 1.5
 """Largest bias, m/s^2; a wind of 4 m/s, which the firmware mistakes for a tilt, causes 1.2. Larger:
 wrong positions can cause a bias larger than any attitude error."""
-MAX_ACCELERATION_BIAS_INNOVATION_MPS2 = 2.0
+MAX_INNOVATION_TO_LEARN_ACCELERATION_BIAS_MPS2 = 2.0
 """Largest difference between measured and estimated acceleration in one sample from which the bias
 is learned, m/s^2; a larger difference is due to an impact or a correction of the estimate. Larger:
 the effect of a 40 ms impact is learned. Smaller: a gust is not learned."""
 MAX_DEAD_RECKONED_CLIMB_RATE_ERROR_MPS = 0.1
 """Margin by which the vehicle may climb faster than dead reckoning says, m/s. Larger: the magnet
 seems to be in reach too early."""
-MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS = 1.0
+MAX_POSSIBLE_CLIMB_RATE_IN_TELEMETRY_GAP_MPS = 1.0
 """Largest climb rate during a gap in the telemetry, m/s: the limit of the position mode."""
 MAGNET_REACH_BELOW_TARGET_M = 0.04
 """Distance below the target at which the magnet may have caught the gear, m. Larger: a flying
 vehicle is treated as one that may hang. Smaller: a caught vehicle is treated as flying."""
-MAX_GEAR_BELOW_TARGET_IF_BOUNCING_M = 0.1
+MAX_GEAR_BELOW_TARGET_TO_FOLLOW_ESTIMATED_CLIMB_M = 0.1
 """Distance below the target within which the reckoned vertical speed follows the estimate, m: a
 bounce off the ceiling happens between two telemetry samples, but the firmware integrates it at 1
 kHz. Larger: errors of the estimate due to late pictures are adopted. Smaller: after a bounce, the
@@ -62,24 +62,25 @@ IMU_MINUS_ESTIMATE_VELOCITY_FORGETTING_TIME_CONSTANT_S = 1.0
 """Time constant with which positions correct a velocity that the estimate has missed, s. Larger: a
 velocity that a wrong attitude accumulates over seconds looks like an impact. Smaller: an impact
 just before the last sighting is forgotten."""
-MAX_ESTIMATED_VELOCITY_BIAS_MPS = 0.6
+MAX_LEARNED_ESTIMATED_VELOCITY_BIAS_MPS = 0.6
 """Largest bias of the estimated velocity, m/s; a wind of 4 m/s causes 0.4. Larger: a moving vehicle
 counts as still while its position creeps. Smaller: in wind, the vehicle never counts as steady."""
-ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S = 2.0
+ESTIMATED_VELOCITY_BIAS_LEARNING_TIME_CONSTANT_S = 2.0
 """Time constant with which the bias of the estimated velocity is learned, s. Larger: after a change
 in the wind, the vehicle seems to move for longer. Smaller: noise of the position is learned as a
 bias."""
 ESTIMATE_MINUS_IMU_VELOCITY_FORGETTING_TIME_CONSTANT_S = 0.5
 """Time constant with which a velocity gained by the estimate alone is forgotten, s."""
-MIN_UNEXPLAINED_POSITION_STEP_M = 0.005
+MIN_POSITION_STEP_TO_COUNT_AS_UNEXPLAINED_M = 0.005
 """Smallest motion of the estimated position, beyond what its velocity explains, that counts as a
 step, m. Smaller: noise counts as a step."""
 UNEXPLAINED_POSITION_STEP_THRESHOLD_GROWTH_MPS = 0.2
-"""Increase of `MIN_UNEXPLAINED_POSITION_STEP_M` for each second between two samples, m/s."""
-MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S = 0.15
+"""Increase of `MIN_POSITION_STEP_TO_COUNT_AS_UNEXPLAINED_M` for each second between two samples,
+m/s."""
+MAX_SAMPLE_INTERVAL_TO_DETECT_POSITION_STEP_S = 0.15
 """Longest time between two samples within which a step is detected, s; over a longer time, the step
 may be the vehicle's motion."""
-MAX_NEGLIGIBLE_POSITION_LAG_S = 0.05
+MAX_POSITION_LAG_TO_COUNT_AS_CURRENT_S = 0.05
 """Longest time for which the position in a sample is regarded as current, s."""
 ACCELERATION_BIAS_SIGMA_MPS2 = 0.06
 """Standard deviation of the acceleration bias in a dead-reckoned position, m/s^2. Smaller: the
@@ -87,7 +88,7 @@ offset of a contact is reported as more precise than it is."""
 VELOCITY_SIGMA_AT_SIGHTING_MPS = 0.01
 """Standard deviation of the dead-reckoned velocity at the last sighting, m/s. Smaller: the offset
 of a contact is reported as more precise than it is."""
-POSITION_SIGMA_TO_DISTANCE_FLOWN_RATIO = 0.3
+POSITION_SIGMA_GROWTH_PER_DISTANCE_FLOWN = 0.3
 """Fraction of the distance flown without a sighting that is added to the standard deviation of a
 dead-reckoned position."""
 ACCELERATION_BIAS_PER_ESTIMATE_MINUS_IMU_VELOCITY_PER_S = 1.5
@@ -98,7 +99,7 @@ MAX_HEIGHT_INTEGRATION_STEP_S = 0.5
 
 
 @dataclass(frozen=True)
-class DeadReckoning:
+class DeadReckoningState:
     """Velocity of the vehicle and its position relative to the target, integrated from the
     accelerometer since the last good position or sighting, with the biases learned before.
 
@@ -124,7 +125,8 @@ class DeadReckoning:
         last_sighting_at_s: exposure time of the sighting from which the vector is integrated.
         unexplained_position_step_sum_world_xy_m: sum of the steps of the estimated position since
             that sighting that the estimated velocity does not explain.
-        climb_before_impact_mps: vertical speed just before the newest impact, positive up.
+        climb_rate_before_newest_impact_mps: vertical speed just before the newest impact, positive
+            up.
         estimated_velocity_bias_world_xy_mps: lateral error of the state estimate's velocity.
         mean_estimated_velocity_world_xy_mps, mean_estimated_position_world_xy_m: low-pass filtered
             state estimate, from which that error is learned; the position is None until the filters
@@ -158,7 +160,9 @@ class DeadReckoning:
     # sum of the steps of the estimated position since that sighting
     unexplained_position_step_sum_world_xy_m: tuple[float, float] = (0.0, 0.0)
     last_unexplained_position_step_at_s: float = -math.inf  # time of the newest step
-    climb_before_impact_mps: float = 0.0  # vertical speed just before `ImuMotion.newest_impact`
+    climb_rate_before_newest_impact_mps: float = (
+        0.0  # vertical speed just before `ImuMotion.newest_impact`
+    )
     # lateral bias of the estimated velocity
     estimated_velocity_bias_world_xy_mps: tuple[float, float] = (0.0, 0.0)
     # estimated velocity after a low-pass filter
@@ -169,7 +173,7 @@ class DeadReckoning:
 
 
 def advance_dead_reckoning(
-    old: DeadReckoning,
+    old: DeadReckoningState,
     imu: ImuMotion,
     sample: Telemetry,
     *,
@@ -177,7 +181,7 @@ def advance_dead_reckoning(
     is_position_diverged: bool = False,
     is_estimated_velocity_being_corrected: bool = False,
     ignores_lateral_estimate: bool = False,
-) -> DeadReckoning:
+) -> DeadReckoningState:
     """Return the dead reckoning one tick later, advanced by the velocity that `imu` has gained
     since `old`. `sample` is the newest sample of `imu`. At the first sample, after a gap in the
     telemetry, or while the attitude is frozen, the dead reckoning restarts instead: the velocity
@@ -199,16 +203,16 @@ def advance_dead_reckoning(
         carried = not old.imu_at_last_update.t_s < imu.last_telemetry_gap_ended_at_s <= impact.t_s
         carried_mps = (
             old.velocity_world_mps[2]
-            + impact.imu_climb_before_impact_mps
+            + impact.imu_climb_rate_before_impact_mps
             - old.imu_at_last_update.velocity_since_first_sample_world_mps[2]
         )
         old = replace(
             old,
-            climb_before_impact_mps=carried_mps
+            climb_rate_before_newest_impact_mps=carried_mps
             if carried
-            else impact.estimated_climb_before_impact_mps,
+            else impact.estimated_climb_rate_before_impact_mps,
         )
-    frozen = imu.attitude_frozen_for_s > MAX_FROZEN_READING_DURATION_S
+    frozen = imu.attitude_frozen_for_s > MAX_FROZEN_READING_DURATION_TO_TRUST_SAMPLE_S
     if (
         old.imu_at_last_update is None
         or imu.last_telemetry_gap_ended_at_s > old.imu_at_last_update.t_s
@@ -233,13 +237,13 @@ def advance_dead_reckoning(
 
 
 def _restart_dead_reckoning(
-    old: DeadReckoning,
+    old: DeadReckoningState,
     imu: ImuMotion,
     estimated_velocity_world_mps: Vector,
     *,
     is_estimate_trusted: bool,
     is_position_diverged: bool,
-) -> DeadReckoning:
+) -> DeadReckoningState:
     """Return the dead reckoning at the first sample, after a gap in the telemetry, or while the
     attitude is frozen, when `imu` cannot be integrated.
 
@@ -294,7 +298,9 @@ def _restart_dead_reckoning(
         climb_mps = max(0.0, old.velocity_world_mps[2]) + MAX_DEAD_RECKONED_CLIMB_RATE_ERROR_MPS
         climb_m = climb_mps**2 / (2.0 * GRAVITY_MPS2)
         if flew:
-            climb_m = MAX_CLIMB_RATE_IN_TELEMETRY_GAP_MPS * (imu.t_s - old.imu_at_last_update.t_s)
+            climb_m = MAX_POSSIBLE_CLIMB_RATE_IN_TELEMETRY_GAP_MPS * (
+                imu.t_s - old.imu_at_last_update.t_s
+            )
         gear_below_target_lower_bound_m = old.gear_below_target_lower_bound_m - climb_m
         near = gear_below_target_lower_bound_m < MAGNET_REACH_BELOW_TARGET_M
         unknown = replace(
@@ -309,7 +315,7 @@ def _restart_dead_reckoning(
 
 
 def _integrate_sample(
-    old: DeadReckoning,
+    old: DeadReckoningState,
     previous_imu: ImuMotion,
     imu: ImuMotion,
     sample: Telemetry,
@@ -317,7 +323,7 @@ def _integrate_sample(
     is_estimate_trusted: bool,
     is_estimated_velocity_being_corrected: bool,
     ignores_lateral_estimate: bool,
-) -> DeadReckoning:
+) -> DeadReckoningState:
     """Return the dead reckoning at `sample`, the newest sample of `imu`, advanced from
     `previous_imu`, one tick earlier. It is unchanged without a new sample.
 
@@ -363,7 +369,7 @@ def _integrate_sample(
         if (
             i == 2
             and is_estimate_trusted
-            and old.gear_below_target_m < MAX_GEAR_BELOW_TARGET_IF_BOUNCING_M
+            and old.gear_below_target_m < MAX_GEAR_BELOW_TARGET_TO_FOLLOW_ESTIMATED_CLIMB_M
         ):
             gained = (
                 estimated_velocity_world_mps[2]
@@ -383,7 +389,7 @@ def _integrate_sample(
             missed[i] = remembers * old.recent_imu_minus_estimate_velocity_world_xy_mps[i] + alone
         if is_estimate_trusted and (i == 2 or not ignores_lateral_estimate):
             v += (estimated_velocity_world_mps[i] - v) * min(
-                1.0, dt_s / VELOCITY_CORRECTION_BY_ESTIMATE_TIME_CONSTANT_S
+                1.0, dt_s / DEAD_RECKONED_VELOCITY_CORRECTION_TIME_CONSTANT_S
             )
             wrong = (
                 gained - (estimated_velocity_world_mps[i] - old.estimated_velocity_world_mps[i])
@@ -398,11 +404,11 @@ def _integrate_sample(
                 recent_estimate_minus_imu_velocity_world_xy_mps[i] = (
                     keeps * old.recent_estimate_minus_imu_velocity_world_xy_mps[i] + more
                 )
-            if abs(wrong) <= MAX_ACCELERATION_BIAS_INNOVATION_MPS2:
-                share = min(1.0, dt_s / ACCELERATION_BIAS_TIME_CONSTANT_S)
+            if abs(wrong) <= MAX_INNOVATION_TO_LEARN_ACCELERATION_BIAS_MPS2:
+                share = min(1.0, dt_s / ACCELERATION_BIAS_LEARNING_TIME_CONSTANT_S)
                 b = max(
-                    -MAX_ACCELERATION_BIAS_MPS2,
-                    min(MAX_ACCELERATION_BIAS_MPS2, b + share * (wrong - b)),
+                    -MAX_LEARNED_ACCELERATION_BIAS_MPS2,
+                    min(MAX_LEARNED_ACCELERATION_BIAS_MPS2, b + share * (wrong - b)),
                 )
                 if i < 2:
                     mean_specific_force_world_xy_mps2[i] += share * (
@@ -416,7 +422,7 @@ def _integrate_sample(
     step_m = math.hypot(vx, vy) * dt_s
     growth_m = (
         VELOCITY_SIGMA_AT_SIGHTING_MPS + ACCELERATION_BIAS_SIGMA_MPS2 * unseen_s
-    ) * dt_s + POSITION_SIGMA_TO_DISTANCE_FLOWN_RATIO * step_m
+    ) * dt_s + POSITION_SIGMA_GROWTH_PER_DISTANCE_FLOWN * step_m
     ex, ey = old.gear_to_target_world_xy_m
     return replace(
         old,
@@ -443,8 +449,8 @@ def _integrate_sample(
 
 
 def learn_estimated_velocity_bias(
-    old: DeadReckoning, previous_sample: Telemetry, sample: Telemetry
-) -> DeadReckoning:
+    old: DeadReckoningState, previous_sample: Telemetry, sample: Telemetry
+) -> DeadReckoningState:
     """Return the dead reckoning with the lateral bias of the estimated velocity (world x and y)
     learned from `previous_sample` and `sample`, the newest samples of two successive ticks, during
     a flight in free air under position control.
@@ -452,12 +458,13 @@ def learn_estimated_velocity_bias(
     In a steady wind, the firmware mistakes the drag for a tilt, and the estimated velocity is wrong
     by up to 0.4 m/s while the vehicle hovers in place. The bias is the estimated velocity minus the
     velocity of the estimated position, both passed through the same low-pass filter. The learned
-    bias is wrong for about `ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S` after a change in the wind.
+    bias is wrong for about `ESTIMATED_VELOCITY_BIAS_LEARNING_TIME_CONSTANT_S` after a change in the
+    wind.
     """
     dt_s = sample.t_s - previous_sample.t_s
-    if not 0.0 < dt_s <= MAX_TELEMETRY_GAP_S:
+    if not 0.0 < dt_s <= MAX_SAMPLE_INTERVAL_WITHOUT_TELEMETRY_GAP_S:
         return restart_velocity_bias_filters(old)
-    share = 1.0 - math.exp(-dt_s / ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S)
+    share = 1.0 - math.exp(-dt_s / ESTIMATED_VELOCITY_BIAS_LEARNING_TIME_CONSTANT_S)
     before_m = old.mean_estimated_position_world_xy_m or sample.position_m[:2]
     before_mps = (
         old.estimated_velocity_bias_world_xy_mps
@@ -470,13 +477,14 @@ def learn_estimated_velocity_bias(
         position.append(before_m[i] + share * (sample.position_m[i] - before_m[i]))
         bias.append(
             velocity[i]
-            - (sample.position_m[i] - position[i]) / ESTIMATED_VELOCITY_BIAS_TIME_CONSTANT_S
+            - (sample.position_m[i] - position[i])
+            / ESTIMATED_VELOCITY_BIAS_LEARNING_TIME_CONSTANT_S
         )
     size_mps = math.hypot(*bias)
     part = (
         1.0
-        if size_mps <= MAX_ESTIMATED_VELOCITY_BIAS_MPS
-        else MAX_ESTIMATED_VELOCITY_BIAS_MPS / size_mps
+        if size_mps <= MAX_LEARNED_ESTIMATED_VELOCITY_BIAS_MPS
+        else MAX_LEARNED_ESTIMATED_VELOCITY_BIAS_MPS / size_mps
     )
     return replace(
         old,
@@ -488,8 +496,8 @@ def learn_estimated_velocity_bias(
 
 
 def learn_acceleration_bias_at_rest(
-    old: DeadReckoning, previous_imu: ImuMotion | None, imu: ImuMotion
-) -> DeadReckoning:
+    old: DeadReckoningState, previous_imu: ImuMotion | None, imu: ImuMotion
+) -> DeadReckoningState:
     """Return the dead reckoning of a vehicle that is held still, so that the whole lateral
     acceleration between `previous_imu` and `imu` is the combined bias of accelerometer and
     attitude. A low-pass filter learns this bias; it is unchanged after a gap in the telemetry. The
@@ -497,7 +505,7 @@ def learn_acceleration_bias_at_rest(
     disappears within a second after the contact."""
     if (
         previous_imu is None
-        or not 0.0 < imu.t_s - previous_imu.t_s <= MAX_TELEMETRY_GAP_S
+        or not 0.0 < imu.t_s - previous_imu.t_s <= MAX_SAMPLE_INTERVAL_WITHOUT_TELEMETRY_GAP_S
         or imu.last_telemetry_gap_ended_at_s > previous_imu.t_s
     ):
         return old
@@ -516,7 +524,7 @@ def learn_acceleration_bias_at_rest(
     return replace(old, acceleration_bias_world_mps2=(*bias, bz))
 
 
-def restart_velocity_bias_filters(old: DeadReckoning) -> DeadReckoning:
+def restart_velocity_bias_filters(old: DeadReckoningState) -> DeadReckoningState:
     """Return the dead reckoning with the low-pass filters of estimated velocity and position reset,
     from which `learn_estimated_velocity_bias` learns the bias; they restart at the next sample. The
     bias learned so far is kept. Called while the bias cannot be learned, for example after a gap in
@@ -528,7 +536,7 @@ def restart_velocity_bias_filters(old: DeadReckoning) -> DeadReckoning:
     )
 
 
-def correct_acceleration_bias_for_wrong_positions(old: DeadReckoning) -> DeadReckoning:
+def correct_acceleration_bias_for_wrong_positions(old: DeadReckoningState) -> DeadReckoningState:
     """Return the dead reckoning with its lateral acceleration bias (world x and y) corrected, once
     external positions are known to be wrong, for example because the axes of the motion capture are
     rotated.
@@ -553,18 +561,18 @@ def correct_acceleration_bias_for_wrong_positions(old: DeadReckoning) -> DeadRec
 
 
 def accumulate_unexplained_position_step(
-    old: DeadReckoning, previous_sample: Telemetry, sample: Telemetry
-) -> DeadReckoning:
+    old: DeadReckoningState, previous_sample: Telemetry, sample: Telemetry
+) -> DeadReckoningState:
     """Return the dead reckoning after adding an unexplained step of the estimated position, if
     there was one, to the sum of such steps. Their sum makes the offset at a contact less certain.
 
     The step (world x and y) is the motion of the estimated position from `previous_sample` to
     `sample`, minus the mean of the two estimated velocities times the time. It is ignored below a
     threshold that grows with the time between the samples, and if this time is more than
-    `MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S`, because it may then be the vehicle's motion.
+    `MAX_SAMPLE_INTERVAL_TO_DETECT_POSITION_STEP_S`, because it may then be the vehicle's motion.
     """
     dt_s = _position_timestamp_s(sample) - _position_timestamp_s(previous_sample)
-    if not 0.0 < dt_s <= MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S:
+    if not 0.0 < dt_s <= MAX_SAMPLE_INTERVAL_TO_DETECT_POSITION_STEP_S:
         return old
     x_m, y_m = (
         sample.position_m[i]
@@ -574,7 +582,8 @@ def accumulate_unexplained_position_step(
     )
     if (
         math.hypot(x_m, y_m)
-        <= MIN_UNEXPLAINED_POSITION_STEP_M + UNEXPLAINED_POSITION_STEP_THRESHOLD_GROWTH_MPS * dt_s
+        <= MIN_POSITION_STEP_TO_COUNT_AS_UNEXPLAINED_M
+        + UNEXPLAINED_POSITION_STEP_THRESHOLD_GROWTH_MPS * dt_s
     ):
         return old
     sx_m, sy_m = old.unexplained_position_step_sum_world_xy_m
@@ -587,18 +596,18 @@ def accumulate_unexplained_position_step(
 
 def _position_timestamp_s(sample: Telemetry) -> float:
     """Return the time, s, at which the sample's position was valid. The position is older than the
-    attitude by the sample's `behind_s`; a difference of at most `MAX_NEGLIGIBLE_POSITION_LAG_S` is
-    ignored."""
-    return sample.t_s - max(0.0, sample.behind_s - MAX_NEGLIGIBLE_POSITION_LAG_S)
+    attitude by the sample's `behind_s`; a difference of at most
+    `MAX_POSITION_LAG_TO_COUNT_AS_CURRENT_S` is ignored."""
+    return sample.t_s - max(0.0, sample.behind_s - MAX_POSITION_LAG_TO_COUNT_AS_CURRENT_S)
 
 
 def restart_dead_reckoning_at_sighting(
-    old: DeadReckoning,
+    old: DeadReckoningState,
     t_s: float,
     gear_to_target_world_xy_m: tuple[float, float],
     gear_below_target_m: float,
     sigma_m: float,
-) -> DeadReckoning:
+) -> DeadReckoningState:
     """Return the dead reckoning with its position relative to the target replaced by that of a
     picture exposed at `t_s`; the velocity is kept.
 

@@ -19,10 +19,10 @@ VISUAL_VELOCITY_TIME_CONSTANT_S = 0.1
 """Time constant of the low-pass filter on the velocity from pictures, s. Larger: a descent
 controlled with this velocity oscillates. Smaller: the noise of single detections moves the
 vehicle."""
-MAX_DETECTION_GAP_FOR_VELOCITY_S = 1.0
+MAX_DETECTION_INTERVAL_TO_COMPUTE_VELOCITY_S = 1.0
 """Longest time between two detections from which a velocity is computed, s. Larger: a motion that
 has ended still counts. Smaller: a few lost pictures leave the velocity unknown."""
-MIN_DETECTION_TIME_TO_KNOW_VELOCITY_S = 0.3
+MIN_UNINTERRUPTED_DETECTION_TIME_TO_USE_VELOCITY_S = 0.3
 """Time for which the target must be detected before the velocity is used, s. Smaller: the low-pass
 filter has not settled."""
 MAX_PLAUSIBLE_VISUAL_VELOCITY_MPS = 1.5
@@ -103,7 +103,7 @@ class TargetBelief:
 
 
 @dataclass(frozen=True)
-class VisualMotion:
+class VisualVelocityFilter:
     """The vehicle's velocity from pictures of a stationary target, for use without telemetry.
 
     The vehicle moves by -de/dt, where e is the target's position relative to the gear in the level
@@ -128,22 +128,26 @@ class VisualMotion:
     @property
     def is_velocity_known(self) -> bool:
         """True if the target has been detected for long enough to determine the velocity."""
-        return self.t_s - self.detection_began_at_s >= MIN_DETECTION_TIME_TO_KNOW_VELOCITY_S
+        return (
+            self.t_s - self.detection_began_at_s
+            >= MIN_UNINTERRUPTED_DETECTION_TIME_TO_USE_VELOCITY_S
+        )
 
-    def with_detection(self, target: TargetEstimate) -> VisualMotion:
+    def with_detection(self, target: TargetEstimate) -> VisualVelocityFilter:
         """Return the motion after a frame that measured the target at `target.last_measured_at_s`.
 
         A frame that is not newer than the last one changes nothing. After a gap of more than
-        `MAX_DETECTION_GAP_FOR_VELOCITY_S`, the velocity is unknown again. A step of the target
-        faster than `MAX_PLAUSIBLE_VISUAL_VELOCITY_MPS` changes the position but not the velocity.
+        `MAX_DETECTION_INTERVAL_TO_COMPUTE_VELOCITY_S`, the velocity is unknown again. A step of the
+        target faster than `MAX_PLAUSIBLE_VISUAL_VELOCITY_MPS` changes the position but not the
+        velocity.
         """
         x_m, y_m, z_m = (float(v) for v in target.e_m)
         e_m, t_s = (x_m, y_m, z_m), target.last_measured_at_s
         dt_s = t_s - self.t_s
         if dt_s <= 0.0:
             return self
-        if dt_s > MAX_DETECTION_GAP_FOR_VELOCITY_S:
-            return VisualMotion(t_s, t_s, e_m)
+        if dt_s > MAX_DETECTION_INTERVAL_TO_COMPUTE_VELOCITY_S:
+            return VisualVelocityFilter(t_s, t_s, e_m)
         moved_mps = [
             (before - now) / dt_s
             for before, now in zip(self.gear_to_target_level_m, e_m, strict=True)
@@ -155,4 +159,4 @@ class VisualMotion:
             old + share * (new - old)
             for old, new in zip(self.vehicle_velocity_level_mps, moved_mps, strict=True)
         )
-        return VisualMotion(t_s, self.detection_began_at_s, e_m, (ahead, left, up))
+        return VisualVelocityFilter(t_s, self.detection_began_at_s, e_m, (ahead, left, up))

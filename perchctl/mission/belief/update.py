@@ -26,8 +26,8 @@ from perchctl.mission.belief.belief import ESTIMATE_SETTLING_TIME_AFTER_POSITION
 from perchctl.mission.belief.contact import (
     HANGING_CONFIRMATION_DWELL_S,
     IMU_SHOWS_SUPPORT,
-    MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M,
-    MAX_RAW_THRUST,
+    MAX_HEIGHT_TO_COUNT_AS_STANDING_BEFORE_TAKEOFF_M,
+    MAX_RAW_THRUST_APPLIED_BY_FIRMWARE,
     MOTORS_OFF_AS_COMMANDED,
     SUPPORT_CONDITIONS,
     is_evidence_fresh,
@@ -51,8 +51,8 @@ from perchctl.mission.belief.quality import QUALITY_CONDITIONS, hold_reason
 from perchctl.mission.belief.reckoning import (
     MAGNET_REACH_BELOW_TARGET_M,
     MAX_HEIGHT_INTEGRATION_STEP_S,
-    MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S,
-    DeadReckoning,
+    MAX_SAMPLE_INTERVAL_TO_DETECT_POSITION_STEP_S,
+    DeadReckoningState,
     accumulate_unexplained_position_step,
     advance_dead_reckoning,
     learn_acceleration_bias_at_rest,
@@ -67,24 +67,24 @@ from perchctl.vehicle import FULL_THRUST, Command, Idle, PositionSetpoint, RawTh
 
 BELIEF_CONDITIONS = (*SUPPORT_CONDITIONS, *QUALITY_CONDITIONS)
 """All conditions that are evaluated on the belief."""
-MAX_GEAR_BELOW_TARGET_IF_HELD_BY_TARGET_M = 0.3
+MAX_GEAR_BELOW_TARGET_TO_COUNT_AS_HELD_BY_TARGET_M = 0.3
 """Distance of the gear below the target within which it must be the target that supports the
 vehicle, m."""
-STILL_AT_CONTACT_DWELL_S = 0.3
+MOTIONLESS_AT_CONTACT_DWELL_S = 0.3
 """Time for which a vehicle at its contact must be still to count as at rest, s."""
-MAX_SAMPLE_INTERVAL_IN_FILTERS_S = 0.1
+SAMPLE_INTERVAL_UPPER_CLAMP_IN_FILTERS_S = 0.1
 """Longest time that a single sample may represent in the filters of hover thrust and tilt, s.
 Larger: after a gap, a single sample has the weight of many."""
-MAX_THRUST_DEVIATION_FROM_COMMAND_FRACTION = 0.12
+MAX_REPORTED_THRUST_DEVIATION_FRACTION_IF_COMMAND_FOLLOWED = 0.12
 """Difference between commanded and reported thrust that no ramp can cause, as a fraction of full
 thrust."""
-KEEPALIVE_RAW_THRUST = 1000
+COMMANDED_KEEPALIVE_RAW_THRUST = 1000
 """Raw thrust, 0..65535, that does not turn the motors but still satisfies the setpoint watchdog."""
 MEAN_THRUST_DIRECTION_TIME_CONSTANT_S = 0.5
 """Time constant of the mean tilt, s. Larger: a gust, or a changing error of the estimated attitude,
 moves the vehicle off the target's axis. Smaller: feedback of the tilt no longer damps the
 motion."""
-TARGET_SCATTER_DECAY_FACTOR_PER_FRAME = 0.9
+RECENT_MAX_TARGET_SHIFT_DECAY_FACTOR_PER_PICTURE = 0.9
 """Fraction of the target's scatter that remains after each frame."""
 
 
@@ -171,7 +171,7 @@ def _update_target(b: Belief) -> Belief:
     target = b.obs.target
     if not b.obs.has_new_frame or target is None or not target.is_measured_in_newest_frame:
         return b
-    b = replace(b, visual_motion=b.visual_motion.with_detection(target))
+    b = replace(b, visual_velocity_filter=b.visual_velocity_filter.with_detection(target))
     if target.measured_gear_to_target_world_m is not None and math.isfinite(
         target.measured_gear_to_target_sigma_m
     ):
@@ -186,10 +186,14 @@ def _update_target(b: Belief) -> Belief:
     if b.last_target_position_world_m is not None:
         moved_m = float(np.linalg.norm(target.world_m - b.last_target_position_world_m))
         spread_m = max(
-            moved_m, TARGET_SCATTER_DECAY_FACTOR_PER_FRAME * b.recent_max_target_shift_per_frame_m
+            moved_m,
+            RECENT_MAX_TARGET_SHIFT_DECAY_FACTOR_PER_PICTURE
+            * b.recent_max_target_world_shift_between_pictures_m,
         )
     return replace(
-        b, last_target_position_world_m=target.world_m, recent_max_target_shift_per_frame_m=spread_m
+        b,
+        last_target_position_world_m=target.world_m,
+        recent_max_target_world_shift_between_pictures_m=spread_m,
     )
 
 
@@ -243,7 +247,7 @@ def _shift_stored_positions_after_frame_jump(b: Belief) -> Belief:
         b.position_last_stale_at_s is not None
         and obs.t_s - b.position_last_stale_at_s <= ESTIMATE_SETTLING_TIME_AFTER_POSITIONS_RETURN_S
     )
-    if dt_s > MAX_SAMPLE_INTERVAL_FOR_POSITION_STEP_S or returns:
+    if dt_s > MAX_SAMPLE_INTERVAL_TO_DETECT_POSITION_STEP_S or returns:
         moved_m = (0.0, 0.0, 0.0)
     setpoint = b.command_history.setpoint
     if setpoint is not None:
@@ -271,15 +275,21 @@ def _translate(position_m: Vector, shift_m: Vector) -> Vector:
 def _compare_thrust_with_command(b: Belief) -> Belief:
     """Return the belief after comparing the reported thrust with the commanded raw thrust;
     unchanged if no raw thrust is commanded. `thrust_began_to_differ_from_command_at_s` is the loop
-    time since which the two have differed by more than `MAX_THRUST_DEVIATION_FROM_COMMAND_FRACTION`
-    of full thrust, None while they agree. If the difference has lasted too long for the reported
-    thrust to be reliable, `thrust_last_differed_from_command_at_s` becomes the present time."""
+    time since which the two have differed by more than
+    `MAX_REPORTED_THRUST_DEVIATION_FRACTION_IF_COMMAND_FOLLOWED` of full thrust, None while they
+    agree. If the difference has lasted too long for the reported thrust to be reliable,
+    `thrust_last_differed_from_command_at_s` becomes the present time."""
     order = b.command_history.commanded_raw_thrust
     if order is None:
         return b
-    wanted = 0.0 if order < KEEPALIVE_RAW_THRUST else min(MAX_RAW_THRUST, order)
+    wanted = (
+        0.0
+        if order < COMMANDED_KEEPALIVE_RAW_THRUST
+        else min(MAX_RAW_THRUST_APPLIED_BY_FIRMWARE, order)
+    )
     apart = (
-        abs(b.telemetry.thrust - wanted) > MAX_THRUST_DEVIATION_FROM_COMMAND_FRACTION * FULL_THRUST
+        abs(b.telemetry.thrust - wanted)
+        > MAX_REPORTED_THRUST_DEVIATION_FRACTION_IF_COMMAND_FOLLOWED * FULL_THRUST
     )
     since_s = (
         b.obs.t_s
@@ -314,7 +324,7 @@ def _update_dead_reckoning(b: Belief) -> Belief:
     )
 
 
-def _integrate_dead_reckoning(b: Belief) -> DeadReckoning:
+def _integrate_dead_reckoning(b: Belief) -> DeadReckoningState:
     """Return the dead reckoning advanced by the newest sample of accelerometer and state estimate.
 
     The bias of the estimated velocity is learned as well while three conditions are met: the
@@ -341,7 +351,7 @@ def _integrate_dead_reckoning(b: Belief) -> DeadReckoning:
     )
     is_in_free_air = (
         b.command_history.maneuver.is_in_free_air
-        and b.height_m > MAX_HEIGHT_STANDING_BEFORE_TAKEOFF_M
+        and b.height_m > MAX_HEIGHT_TO_COUNT_AS_STANDING_BEFORE_TAKEOFF_M
     )
     if (
         is_estimate_trusted
@@ -357,11 +367,11 @@ def _integrate_dead_reckoning(b: Belief) -> DeadReckoning:
     return new
 
 
-def _zero_reckoned_velocity_at_contact(b: Belief, new: DeadReckoning) -> DeadReckoning:
+def _zero_reckoned_velocity_at_contact(b: Belief, new: DeadReckoningState) -> DeadReckoningState:
     """Return the dead reckoning `new`, without vertical speed if the vehicle is at rest at the
     target: the gear is within the magnet's reach, the climb rate has been steady for
-    `STILL_AT_CONTACT_DWELL_S` without a recent fall, and either a contact is recorded or the thrust
-    is too small to fly. Otherwise, `new` is returned unchanged.
+    `MOTIONLESS_AT_CONTACT_DWELL_S` without a recent fall, and either a contact is recorded or the
+    thrust is too small to fly. Otherwise, `new` is returned unchanged.
 
     For a vehicle at rest, the lateral velocity becomes zero too, and the acceleration bias is
     learned, if the lateral velocity has also been steady for that time. With the motors off, the
@@ -372,7 +382,7 @@ def _zero_reckoned_velocity_at_contact(b: Belief, new: DeadReckoning) -> DeadRec
     """
     obs = b.obs
     rests = (
-        obs.t_s - obs.imu.climb_rate_became_steady_at_s >= STILL_AT_CONTACT_DWELL_S
+        obs.t_s - obs.imu.climb_rate_became_steady_at_s >= MOTIONLESS_AT_CONTACT_DWELL_S
         and obs.t_s - obs.imu.last_fall_at_s > HANGING_CONFIRMATION_DWELL_S
     )
     hangs = b.magnet_reach_entered_at_s is not None and is_thrust_too_low_to_fly(b)
@@ -380,7 +390,7 @@ def _zero_reckoned_velocity_at_contact(b: Belief, new: DeadReckoning) -> DeadRec
     if not touched or not new.gear_below_target_m < MAGNET_REACH_BELOW_TARGET_M or not rests:
         return new
     is_laterally_unsteady = (
-        obs.t_s - obs.imu.lateral_velocity_became_steady_at_s < STILL_AT_CONTACT_DWELL_S
+        obs.t_s - obs.imu.lateral_velocity_became_steady_at_s < MOTIONLESS_AT_CONTACT_DWELL_S
     )
     x_mps, y_mps, _ = new.velocity_world_mps
     new = replace(
@@ -398,7 +408,7 @@ def _zero_reckoned_velocity_at_contact(b: Belief, new: DeadReckoning) -> DeadRec
     return new
 
 
-def _adopt_visual_inertial_velocity(b: Belief, new: DeadReckoning) -> DeadReckoning:
+def _adopt_visual_inertial_velocity(b: Belief, new: DeadReckoningState) -> DeadReckoningState:
     """Return the dead reckoning `new` with the lateral velocity and acceleration bias (world axes)
     of the visual-inertial estimate (`VisualInertialMotion`), on which pictures and accelerometer
     agree. If that estimate is not newer than the sample at which the previous tick's dead reckoning
@@ -424,7 +434,7 @@ def _adopt_visual_inertial_velocity(b: Belief, new: DeadReckoning) -> DeadReckon
     )
 
 
-def _restart_at_sighting(b: Belief, new: DeadReckoning) -> DeadReckoning:
+def _restart_at_sighting(b: Belief, new: DeadReckoningState) -> DeadReckoningState:
     """Return the dead reckoning `new`, restarted from the target's position relative to the gear
     after each frame that measured the target. With a deck or motion capture and a valid position,
     it restarts in every tick, since the target's position in the world is known. If the position
@@ -456,11 +466,12 @@ def _restart_at_sighting(b: Belief, new: DeadReckoning) -> DeadReckoning:
     return new
 
 
-def _correct_height_of_supported_vehicle(b: Belief, new: DeadReckoning) -> DeadReckoning:
+def _correct_height_of_supported_vehicle(b: Belief, new: DeadReckoningState) -> DeadReckoningState:
     """Return the dead reckoning `new` with the gear at the target's height and no vertical speed if
     accelerometer and thrust have shown for `perch.contact_dwell_s` that something supports the
-    vehicle, and `new` places the gear less than `MAX_GEAR_BELOW_TARGET_IF_HELD_BY_TARGET_M` below
-    the target. This applies only with the target as the only position source, and not in a descent.
+    vehicle, and `new` places the gear less than
+    `MAX_GEAR_BELOW_TARGET_TO_COUNT_AS_HELD_BY_TARGET_M` below the target. This applies only with
+    the target as the only position source, and not in a descent.
 
     Late pictures make the vehicle seem lower than it is, but a vehicle that is supported just below
     the target must be touching it.
@@ -468,7 +479,7 @@ def _correct_height_of_supported_vehicle(b: Belief, new: DeadReckoning) -> DeadR
     near = (
         b.is_target_position_source
         and not b.command_history.maneuver.descends_to_floor
-        and new.gear_below_target_m < MAX_GEAR_BELOW_TARGET_IF_HELD_BY_TARGET_M
+        and new.gear_below_target_m < MAX_GEAR_BELOW_TARGET_TO_COUNT_AS_HELD_BY_TARGET_M
     )
     if not near or b.true_for_s(IMU_SHOWS_SUPPORT) < b.profile.planner.perch.contact_dwell_s:
         return new
@@ -480,7 +491,7 @@ def _correct_height_of_supported_vehicle(b: Belief, new: DeadReckoning) -> DeadR
     )
 
 
-def _find_magnet_reach_entry_time_s(b: Belief, new: DeadReckoning) -> float | None:
+def _find_magnet_reach_entry_time_s(b: Belief, new: DeadReckoningState) -> float | None:
     """Return the loop time from which the magnet may have held the vehicle; None if the magnet
     cannot hold the vehicle, because no contact is recorded and either the dead reckoning `new`
     places the gear outside the magnet's reach or the floor was detected.
@@ -509,7 +520,7 @@ def _find_magnet_reach_entry_time_s(b: Belief, new: DeadReckoning) -> float | No
     return b.obs.t_s if magnet_reach_entered_at_s is None or again else magnet_reach_entered_at_s
 
 
-def _climb_since_last_tick_m(b: Belief, new: DeadReckoning) -> float:
+def _climb_since_last_tick_m(b: Belief, new: DeadReckoningState) -> float:
     """Return how far a vehicle without a position has climbed since the previous tick, m, positive
     up: the climb rate of the dead reckoning `new` times the time or, after a gap in the telemetry,
     the change of the estimated height. 0 for a vehicle with a position."""
@@ -548,13 +559,15 @@ def _update_estimators(b: Belief) -> Belief:
     dt_s = max(0.0, obs.t_s - b.t_s)
     last_s = obs.telemetry.t_s - dt_s if b.last_telemetry is None else b.last_telemetry.t_s
     # 0: no new sample
-    sample_dt_s = max(0.0, min(MAX_SAMPLE_INTERVAL_IN_FILTERS_S, obs.telemetry.t_s - last_s))
+    sample_dt_s = max(
+        0.0, min(SAMPLE_INTERVAL_UPPER_CLAMP_IN_FILTERS_S, obs.telemetry.t_s - last_s)
+    )
     near_m = b.profile.planner.ascend.near_m
     away = not maneuver.climbs_to_target or b.target.gear_to_target_z_m > near_m
     b = replace(
         b,
         hover_thrust_estimate=b.hover_thrust_estimate.propagate_with_bounded_sigma(dt_s),
-        rotor_thrust=hover.filter_rotor_thrust(b, sample_dt_s),
+        lagged_rotor_raw_thrust=hover.filter_rotor_thrust(b, sample_dt_s),
     )
     found = b.hover_thrust_estimate
     if away and maneuver.learns_hover_thrust and is_flying_at_hover_thrust(b):
@@ -571,7 +584,7 @@ def _update_estimators(b: Belief) -> Belief:
         battery_fit=update_battery_fit_from_telemetry(
             b.battery_fit, obs.telemetry, obs.battery_reading_age_s, dt_s, mah
         ),
-        mounting=b.mounting if held else _update_camera_mounting(b),
+        camera_mounting_monitor=b.camera_mounting_monitor if held else _update_camera_mounting(b),
         mean_thrust_direction_world_xy=_filter_thrust_direction(b, sample_dt_s),
     )
 
@@ -596,9 +609,9 @@ def _update_camera_mounting(b: Belief) -> CameraMountingMonitor:
         and b.is_telemetry_fresh
         and b.command_history.maneuver.is_in_free_air
     ):
-        return b.mounting
+        return b.camera_mounting_monitor
     assert b.last_target_position_world_m is not None
     return update_camera_mounting_monitor(
-        b.mounting,
+        b.camera_mounting_monitor,
         make_camera_mounting_sample(obs.t_s, obs.telemetry, b.last_target_position_world_m),
     )

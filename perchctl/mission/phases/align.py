@@ -14,7 +14,7 @@ from perchctl.mission.context import Context
 from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.endurance import battery_shortfall_text, is_charge_too_low_for_any_attempt
 from perchctl.mission.phase import Phase, Severity
-from perchctl.mission.phases.ascend import HOVER_HEIGHT_TOLERANCE_M
+from perchctl.mission.phases.ascend import MAX_HEIGHT_ERROR_TO_BEGIN_HOVER_M
 from perchctl.mission.phases.recover import has_recovered
 from perchctl.mission.setpoints import (
     MIN_HELD_SETPOINT_HEIGHT_ABOVE_GROUND_M,
@@ -85,11 +85,11 @@ def planned_hover_height_above_ground_m(c: Context) -> float | None:
 def is_planned_hover_height_unsafe(c: Context) -> bool:
     """True if the vehicle is aligned and would hover lower than
     `MIN_HELD_SETPOINT_HEIGHT_ABOVE_GROUND_M` above the ground, or higher than `safety.max_height_m`
-    minus `HOVER_HEIGHT_TOLERANCE_M`. False if the mission does not hover."""
+    minus `MAX_HEIGHT_ERROR_TO_BEGIN_HOVER_M`. False if the mission does not hover."""
     height_m = planned_hover_height_above_ground_m(c)
     if height_m is None or not is_aligned(c):
         return False
-    highest_m = c.safety.max_height_m - HOVER_HEIGHT_TOLERANCE_M
+    highest_m = c.safety.max_height_m - MAX_HEIGHT_ERROR_TO_BEGIN_HOVER_M
     return not MIN_HELD_SETPOINT_HEIGHT_ABOVE_GROUND_M <= height_m <= highest_m
 
 
@@ -100,7 +100,7 @@ def unsafe_hover_height_reason(c: Context) -> str:
     hover, height_m = c.planner.hover, planned_hover_height_above_ground_m(c)
     assert hover is not None
     assert height_m is not None
-    highest_m = c.safety.max_height_m - HOVER_HEIGHT_TOLERANCE_M
+    highest_m = c.safety.max_height_m - MAX_HEIGHT_ERROR_TO_BEGIN_HOVER_M
     return (
         f"{hover.below_m:g} m below the target is {height_m:.2f} m above the ground, but the "
         f"vehicle hovers only {MIN_HELD_SETPOINT_HEIGHT_ABOVE_GROUND_M:g} to {highest_m:g} m "

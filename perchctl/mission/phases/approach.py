@@ -11,7 +11,7 @@ from perchctl.mission.setpoints import Action, fly_to, step_setpoint_towards
 from perchctl.mission.transition import Transition, land_row
 from perchctl.vehicle import PositionSetpoint
 
-MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M = 0.1
+MIN_HEIGHT_TO_CORRECT_SETPOINT_HEIGHT_M = 0.1
 """Height below which the vehicle may still be on the ground, m; the height is not corrected there.
 Larger: a heavy vehicle stays near the ground for longer. Smaller: a vehicle that is still on the
 ground jumps up."""
@@ -43,15 +43,15 @@ def act_in_approach(c: Context) -> Action:
     planner, state, b = c.planner, c.state, c.belief
     assert b.takeoff_position_m is not None
     x, y, z = b.takeoff_position_m
-    start = state.setpoint or PositionSetpoint(x, y, z, state.entry.yaw_rad)
+    start = state.setpoint or PositionSetpoint(x, y, z, state.entry.vehicle_world_yaw_rad)
     if (
         planner.approach_xy_m is not None
         and b.height_m > MIN_TAKEOFF_HEIGHT_FRACTION_FOR_LATERAL_APPROACH * planner.takeoff_height_m
     ):
         x, y = planner.approach_xy_m
-    goal = PositionSetpoint(x, y, z + planner.takeoff_height_m, state.entry.yaw_rad)
+    goal = PositionSetpoint(x, y, z + planner.takeoff_height_m, state.entry.vehicle_world_yaw_rad)
     setpoint = step_setpoint_towards(c, start, goal, max_up_mps=planner.takeoff_speed_mps)
-    return fly_to(c, setpoint, corrects_height=b.height_m > MIN_HEIGHT_FOR_HEIGHT_CORRECTION_M)
+    return fly_to(c, setpoint, corrects_height=b.height_m > MIN_HEIGHT_TO_CORRECT_SETPOINT_HEIGHT_M)
 
 
 APPROACH = PhaseDefinition(

@@ -20,7 +20,7 @@ from perchctl.mission.state import PlannerState
 from perchctl.mission.transition import Transition, back_off_row
 from perchctl.values import replace
 
-MAX_OFFSET_TO_CONE_RADIUS_RATIO_TO_CLIMB = 0.7
+MAX_LATERAL_ERROR_TO_CONE_RADIUS_RATIO_TO_CLIMB = 0.7
 """Fraction of the cone's radius within which the vehicle climbs. Larger: the vehicle leaves the
 cone and returns to ALIGN."""
 MAX_SETPOINT_HEIGHT_ABOVE_VEHICLE_IN_ASCENT_M = 0.15
@@ -28,10 +28,10 @@ MAX_SETPOINT_HEIGHT_ABOVE_VEHICLE_IN_ASCENT_M = 0.15
 far ahead of a weak vehicle."""
 MIN_ASCENT_SETPOINT_CLIMB_RATE_MPS = 0.02
 """Lowest speed at which the setpoint approaches the stand-off, m/s."""
-HOVER_HEIGHT_TOLERANCE_M = 0.05
+MAX_HEIGHT_ERROR_TO_BEGIN_HOVER_M = 0.05
 """Largest vertical distance from the hover position at which the vehicle has reached it, m. Larger:
 the hover begins during the climb. Smaller: a height error prevents the hover from beginning."""
-HOVER_SETPOINT_HEIGHT_TOLERANCE_M = 0.01
+MAX_SETPOINT_HEIGHT_ERROR_TO_BEGIN_HOVER_M = 0.01
 """Largest vertical distance of the setpoint from the hover position at which the hover can begin,
 m; the setpoint stays at its height during the hover. Larger: the vehicle hovers too low. Smaller:
 noise in the target's estimated height prevents the hover from beginning."""
@@ -91,18 +91,19 @@ def _is_settled_at_standoff(c: Context) -> bool:
 
 def _is_at_hover_position(c: Context) -> bool:
     """True if the vehicle is slow, its gear and its setpoint are at the height at which the mission
-    hovers (within `HOVER_HEIGHT_TOLERANCE_M` and `HOVER_SETPOINT_HEIGHT_TOLERANCE_M`), and the
-    camera has seen the target recently. The gear's lateral offset from the target's axis and the
-    heading must be within the tolerances of ALIGN; those of the stand-off do not apply, since the
-    small marker may be too far away to be seen."""
+    hovers (within `MAX_HEIGHT_ERROR_TO_BEGIN_HOVER_M` and
+    `MAX_SETPOINT_HEIGHT_ERROR_TO_BEGIN_HOVER_M`), and the camera has seen the target recently. The
+    gear's lateral offset from the target's axis and the heading must be within the tolerances of
+    ALIGN; those of the stand-off do not apply, since the small marker may be too far away to be
+    seen."""
     align, target, setpoint = c.planner.align, c.belief.target, c.state.setpoint
     goal_z_m = target.vehicle_world_z_when_touching_m - ascent_end_distance_below_target_m(c)
     return (
         target.is_fresh
         and setpoint is not None
-        and abs(setpoint.z_m - goal_z_m) <= HOVER_SETPOINT_HEIGHT_TOLERANCE_M
+        and abs(setpoint.z_m - goal_z_m) <= MAX_SETPOINT_HEIGHT_ERROR_TO_BEGIN_HOVER_M
         and abs(target.gear_to_target_z_m - ascent_end_distance_below_target_m(c))
-        <= HOVER_HEIGHT_TOLERANCE_M
+        <= MAX_HEIGHT_ERROR_TO_BEGIN_HOVER_M
         and target.gear_to_target_distance_xy_m <= align.xy_m
         and abs(target.vehicle_to_target_yaw_rad) <= math.radians(align.yaw_deg)
         and c.belief.speed_mps <= MAX_SPEED_TO_COUNT_AS_HOVERING_MPS
@@ -159,7 +160,7 @@ def act_in_ascend(c: Context) -> Action:
     may_climb = (
         target.is_fresh
         and target.gear_to_target_distance_xy_m
-        < MAX_OFFSET_TO_CONE_RADIUS_RATIO_TO_CLIMB * ascent_cone_radius_at_gear_m(c)
+        < MAX_LATERAL_ERROR_TO_CONE_RADIUS_RATIO_TO_CLIMB * ascent_cone_radius_at_gear_m(c)
     )
     lag_m = setpoint.z_m - c.telemetry.position_m[2]
     speed = ascend.near_speed_mps if target.gear_to_target_z_m < ascend.near_m else ascend.speed_mps

@@ -10,7 +10,7 @@ from perchctl.mission.phase import Phase, Severity
 from perchctl.mission.setpoints import Action, fly_to, make_setpoint_at_vehicle
 from perchctl.mission.transition import Transition
 
-TARGET_UNTRACKED_TIMEOUT_S = 1.0
+TARGET_UNTRACKED_TIMEOUT_TO_RESTART_SEARCH_S = 1.0
 """Time without the target after which the search restarts, s."""
 
 TARGET_UNTRACKED = Condition[Context]("untracked", lambda c: not c.belief.target.is_tracked)
@@ -19,7 +19,7 @@ TARGET_POSITION_STEADY = Condition[Context](
     "estimated",
     lambda c: (
         c.belief.target.is_fresh
-        and c.belief.recent_max_target_shift_per_frame_m <= c.planner.estimate.spread_m
+        and c.belief.recent_max_target_world_shift_between_pictures_m <= c.planner.estimate.spread_m
     ),
 )
 """The target is fresh, and its position is steady within `estimate.spread_m`."""
@@ -43,7 +43,7 @@ ESTIMATE = PhaseDefinition(
             "estimate-lost",
             {Phase.ESTIMATE},
             lambda c: (
-                c.true_for_s(TARGET_UNTRACKED) > TARGET_UNTRACKED_TIMEOUT_S
+                c.true_for_s(TARGET_UNTRACKED) > TARGET_UNTRACKED_TIMEOUT_TO_RESTART_SEARCH_S
                 or c.time_in_phase_s > c.planner.estimate.timeout_s
             ),
             Phase.SEARCH,

@@ -21,7 +21,7 @@ from perchctl.mission.phases.ascend import (
     is_target_lost,
 )
 from perchctl.mission.setpoints import Action, fly_under_target, make_setpoint_at_vehicle
-from perchctl.mission.state import HoverErrors, PlannerState
+from perchctl.mission.state import HoverErrorAccumulator, PlannerState
 from perchctl.mission.transition import Transition, back_off_row, land_row
 from perchctl.profile import HoverConfig
 from perchctl.values import replace
@@ -30,7 +30,7 @@ MAX_SETPOINT_ABOVE_HOVER_HEIGHT_M = 0.02
 """Height of the setpoint above the hover position beyond which it is lowered, m. Larger: a drift of
 the estimated height brings the vehicle closer to the ceiling. Smaller: the noise of the target's
 height lowers it step by step."""
-MAX_SINK_BELOW_HOVER_HEIGHT_M = 0.06
+MAX_SINK_BELOW_HOVER_HEIGHT_BEFORE_CLIMB_BACK_M = 0.06
 """Distance below the hover position beyond which the vehicle climbs back, m. Larger: a drift of the
 estimated height moves the vehicle further. Smaller: the noise of the target's height makes it climb
 back needlessly."""
@@ -40,12 +40,13 @@ MAX_HEIGHT_RETURN_DURATION_TO_KEEP_HOVER_TIMER_S = 5.0
 """Longest duration of a climb back to the hover position after which the hover timer continues, s.
 Larger: a weak vehicle counts as hovering although it is too low. Smaller: a climb in wind restarts
 the timer."""
-MAX_HOVER_HEIGHT_ERROR_M = 0.15
+MAX_HEIGHT_ERROR_TO_KEEP_HOVERING_M = 0.15
 """Vertical distance from the hover position beyond which the vehicle has left it, m. Larger: a
 vehicle that sinks or rises still counts as hovering. Smaller: a gust restarts the timer."""
 
 SUNK_BELOW_HOVER_HEIGHT = Condition[Context](
-    "sunk", lambda c: distance_below_hover_height_m(c) > MAX_SINK_BELOW_HOVER_HEIGHT_M
+    "sunk",
+    lambda c: distance_below_hover_height_m(c) > MAX_SINK_BELOW_HOVER_HEIGHT_BEFORE_CLIMB_BACK_M,
 )
 """The vehicle is too low for a hover."""
 
@@ -77,7 +78,7 @@ def enter_hover(state: PlannerState, previous_context: Context) -> PlannerState:
         and previous_context.time_in_phase_s <= MAX_HEIGHT_RETURN_DURATION_TO_KEEP_HOVER_TIMER_S
     ):
         return state
-    return replace(state, hover_errors=HoverErrors(state.entry.t_s, state.entry.t_s))
+    return replace(state, hover_errors=HoverErrorAccumulator(state.entry.t_s, state.entry.t_s))
 
 
 def act_in_hover(c: Context) -> Action:
@@ -96,11 +97,11 @@ def distance_below_hover_height_m(c: Context) -> float:
 def has_left_hover_position(c: Context) -> bool:
     """True if the gear's offset from the target's axis exceeds the radius of the approach cone
     (`ascent_cone_radius_at_gear_m`), or its height differs from the hover height by more than
-    `MAX_HOVER_HEIGHT_ERROR_M`."""
+    `MAX_HEIGHT_ERROR_TO_KEEP_HOVERING_M`."""
     lateral_m = c.belief.target.gear_to_target_distance_xy_m
     return (
         lateral_m > ascent_cone_radius_at_gear_m(c)
-        or abs(distance_below_hover_height_m(c)) > MAX_HOVER_HEIGHT_ERROR_M
+        or abs(distance_below_hover_height_m(c)) > MAX_HEIGHT_ERROR_TO_KEEP_HOVERING_M
     )
 
 

@@ -34,7 +34,9 @@ def enter_landing(state: PlannerState, previous_context: Context) -> PlannerStat
     diagnosis, b = state.entry.diagnosis, state.belief
     # The mounting may be right and the axes of the motion capture wrong. Position control would
     # then accelerate the landing until the vehicle tips over.
-    capture = b.profile.positioning.source.is_mocap and b.mounting.is_camera_mounting_wrong
+    capture = (
+        b.profile.positioning.source.is_mocap and b.camera_mounting_monitor.is_camera_mounting_wrong
+    )
     if VehicleDiagnosis.EXTERNAL_POSITIONS_WRONG in diagnosis or (
         VehicleDiagnosis.CAMERA_MOUNTING_WRONG in diagnosis and capture
     ):

@@ -18,7 +18,7 @@ from perchctl.mission.definition import PhaseDefinition
 from perchctl.mission.phase import Outcome, Phase, VehicleDiagnosis
 from perchctl.mission.release import (
     catch_falling_vehicle,
-    choose_catch_setpoint_height_above_vehicle_m,
+    choose_fall_catch_setpoint_above_vehicle_m,
     end_press,
     forget_contact_when_below,
 )
@@ -78,7 +78,7 @@ def enter_recover(state: PlannerState, previous_context: Context) -> PlannerStat
         belief=belief,
         motor_stop_commanded_at_s=None,
         weight_transfer_began_at_s=None,
-        catch_setpoint_height_above_vehicle_m=choose_catch_setpoint_height_above_vehicle_m(
+        fall_catch_setpoint_above_vehicle_m=choose_fall_catch_setpoint_above_vehicle_m(
             b.hover_thrust, thrust
         )
         if falls
@@ -130,18 +130,16 @@ def act_in_recover(c: Context) -> Action:
     least_m = min(MIN_DESCENT_TO_COUNT_AS_DETACHED_M, 0.5 * recover.descend_m)
     # During a contact that lasts several seconds, the estimate may drift downwards by this much. In
     # this phase, the vehicle itself must have descended.
-    if c.state.entry.position_m[2] - c.telemetry.position_m[2] >= least_m:
+    if c.state.entry.vehicle_world_position_m[2] - c.telemetry.position_m[2] >= least_m:
         c = Context(forget_contact_when_below(c.state, least_m))
     state, away = end_press(c)
     if away is not None:
         return state, away
-    if state.catch_setpoint_height_above_vehicle_m is not None:
+    if state.fall_catch_setpoint_above_vehicle_m is not None:
         x, y, z = c.telemetry.position_m  # position where the fall has stopped
-        entry = replace(state.entry, position_m=(x, y, z + recover.descend_m))
-        state = replace(
-            state, catch_setpoint_height_above_vehicle_m=None, setpoint=None, entry=entry
-        )
-    z = state.entry.position_m[2] - recover.descend_m
+        entry = replace(state.entry, vehicle_world_position_m=(x, y, z + recover.descend_m))
+        state = replace(state, fall_catch_setpoint_above_vehicle_m=None, setpoint=None, entry=entry)
+    z = state.entry.vehicle_world_position_m[2] - recover.descend_m
     setpoint = state.setpoint or make_setpoint_at_vehicle(c)
     if setpoint.z_m > z:
         setpoint = replace(setpoint, z_m=z)

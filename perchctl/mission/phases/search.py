@@ -35,7 +35,12 @@ def enter_search(state: PlannerState, previous_context: Context) -> PlannerState
     if setpoint is None:
         return state
     place_m = (setpoint.x_m, setpoint.y_m, setpoint.z_m)
-    return replace(state, entry=replace(state.entry, position_m=place_m, yaw_rad=setpoint.yaw_rad))
+    return replace(
+        state,
+        entry=replace(
+            state.entry, vehicle_world_position_m=place_m, vehicle_world_yaw_rad=setpoint.yaw_rad
+        ),
+    )
 
 
 def act_in_search(c: Context) -> Action:
@@ -52,12 +57,12 @@ def act_in_search(c: Context) -> Action:
             search_step_began_at_s=c.t_s,
         )
         c = Context(state)
-    x, y, z = state.entry.position_m
+    x, y, z = state.entry.vehicle_world_position_m
     if b.target.world_position_m is not None:
-        there = vehicle_world_xy_with_gear_under_target_m(c, state.entry.yaw_rad)
-        unconfirmed = b.mounting.is_target_motion_undetermined
+        there = vehicle_world_xy_with_gear_under_target_m(c, state.entry.vehicle_world_yaw_rad)
+        unconfirmed = b.camera_mounting_monitor.is_target_motion_undetermined
         x, y = (
-            _limit_move_before_camera_mounting_check(b.mounting, (x, y), there)
+            _limit_move_before_camera_mounting_check(b.camera_mounting_monitor, (x, y), there)
             if unconfirmed
             else there
         )
@@ -67,7 +72,10 @@ def act_in_search(c: Context) -> Action:
         if state.vehicle_world_z_when_blocked_m is not None:
             top = min(top, state.vehicle_world_z_when_blocked_m - MIN_CLEARANCE_BELOW_OBSTACLE_M)
         height = min(z + search.step_m * state.searched_position_count, top)
-    yaw = state.entry.yaw_rad + math.radians(search.yaw_step_deg) * state.searched_position_count
+    yaw = (
+        state.entry.vehicle_world_yaw_rad
+        + math.radians(search.yaw_step_deg) * state.searched_position_count
+    )
     goal = PositionSetpoint(x, y, height, yaw)
     old = state.setpoint or make_setpoint_at_vehicle(c)
     return fly_to(c, step_setpoint_towards(c, old, goal, max_up_mps=c.planner.ascend.speed_mps))
