@@ -82,13 +82,13 @@ def report(title: str, views: Iterator[View], camera: CameraModel) -> None:
     missed: dict[str, int] = defaultdict(int)
     for view in views:
         pose = best_pose(look(ours, view.image))
-        if pose is None or pose.xyz_yaw_cov is None:
+        if pose is None or pose.level_frame_xyz_yaw_cov is None:
             missed[view.group] += 1
             continue
         # Alone in the picture, the camera counts as level: e is the camera's own frame.
         e = error_of(pose.e_m, pose.e_yaw_rad, view)
         errors[view.group].append(e)
-        squares[view.group].append(float(e @ np.linalg.solve(pose.xyz_yaw_cov, e)))
+        squares[view.group].append(float(e @ np.linalg.solve(pose.level_frame_xyz_yaw_cov, e)))
         target = look(paper, view.image).target
         if target is not None:
             theirs[view.group].append(error_of(target.e_m, target.e_yaw_rad, view))

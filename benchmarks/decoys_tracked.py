@@ -117,7 +117,7 @@ def tracked(decoy: Decoy, in_flight: bool, seed: int, blur_px: float) -> Count:
         attitude = seen.attitude if in_flight else None
         state, output = step(state, Frame(k, k / RATE_HZ, image), attitude, setup)
         target = output.target
-        anew = anew or output.lock_note.startswith("target reacquired")
+        anew = anew or output.target_lock_message.startswith("target reacquired")
         if k < LOCKED:
             assert target is not None, f"no lock in frame {k}"
         elif target is not None:

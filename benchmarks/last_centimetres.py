@@ -119,12 +119,12 @@ def ascent(case: Case, setup: Pipeline, scene: Renderer, seed: int, in_hand: boo
             e, heading = rot_z(-yaw) @ (way - T[:3, :3] @ gear), -yaw
         range_m = FROM_M - SPEED_MPS * t_s
         pose = next(iter(output.poses.values()), None)
-        if pose is None or not state.marker_poses.poses_by_track:
+        if pose is None or not state.marker_poses.poses_by_updated_track:
             rows.append(Row(range_m, False, None, math.nan, took_s))
             continue
         error = np.array([*(pose.e_m - e), wrap_rad(pose.e_yaw_rad - heading)])
-        assert pose.xyz_yaw_cov is not None
-        squared = float(error @ np.linalg.solve(pose.xyz_yaw_cov, error)) / 4.0
+        assert pose.level_frame_xyz_yaw_cov is not None
+        squared = float(error @ np.linalg.solve(pose.level_frame_xyz_yaw_cov, error)) / 4.0
         seen = output.detections.small or output.detections.large
         cut = seen is not None and seen.cov_px2 is not None
         rows.append(Row(range_m, cut, tuple(error.tolist()), squared, took_s))

@@ -263,13 +263,13 @@ class Tracker:
     def _notes(self, output: PipelineOutput) -> Iterator[str]:
         if output.picture_kind != "whole":
             yield INTERLACED
-        if output.lock_note:
-            yield output.lock_note
+        if output.target_lock_message:
+            yield output.target_lock_message
         if output.detections.markers and not output.poses:
             yield _NO_POSE
         if output.detections.is_mirrored_marker_seen:
             yield mirrored_problem(self._config).sentence
-        if output.frames_with_contradicting_markers >= self._disagreement_frames:
+        if output.successive_frames_with_contradicting_markers >= self._disagreement_frames:
             yield _DISAGREE
 
 
@@ -277,16 +277,16 @@ def _add_pose(
     seen: Sighting, state: PipelineState, attitude: VehicleState | None, pipeline: Pipeline
 ) -> Sighting:
     """The sighting with its pose, if the pipeline accepted a pose from this image."""
-    if state.last_pose is None or state.last_pose.pose.t_s != seen.t_s:
+    if state.last_accepted_pose is None or state.last_accepted_pose.pose.t_s != seen.t_s:
         return seen
-    pose, T_body_cam = state.last_pose.pose, pipeline.pose_setup.T_body_cam
+    pose, T_body_cam = state.last_accepted_pose.pose, pipeline.pose_setup.T_body_cam
     R_cam_target = np.asarray(cv2.Rodrigues(pose.rvec_rad)[0]) @ R_MARKER_TARGET
     T_cam_target = make_T(R_cam_target, pose.tvec_m)
     R_level_body = np.eye(3) if attitude is None else attitude.R_level_body
     T_level_cam = make_T(R_level_body, np.zeros(3)) @ T_body_cam
     order = [3, 4, 5, 0, 1, 2]
     covariance = target_rotation_translation_cov_cam(pose)[np.ix_(order, order)]
-    print_m = T_level_cam[:3, :3].T @ pose.shift_per_print_error_sigma_m
+    print_m = T_level_cam[:3, :3].T @ pose.position_shift_per_print_error_sigma_m
     covariance[:3, :3] += print_m @ print_m.T
     level = None if attitude is None else T_level_cam @ T_cam_target
     return replace(seen, T_cam_target=T_cam_target, covariance=covariance, T_level_target=level)

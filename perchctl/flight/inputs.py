@@ -248,7 +248,7 @@ class FlightInputs:
             battery_reading_age_s=self.history.battery_age_s(now_s),
             has_estimated_position_jumped=self.history.jumped,
             heading_jump_rad=self.history.turned_rad,
-            consecutive_marker_conflict_frames=perception.state.frames_with_contradicting_markers,
+            consecutive_marker_conflict_frames=perception.state.successive_frames_with_contradicting_markers,
             camera_latency_above_profile_s=perception.calibration.applied_delay_s,
             camera_latency_sigma_s=perception.latency_sigma_s,
             target_refusal_reason=perception.refused,

@@ -91,8 +91,8 @@ def update_calibration(
     before = attitude_at(history, t_s - delay_s - ATTITUDE_STEP_S)
     after = attitude_at(history, t_s - delay_s + ATTITUDE_STEP_S)
     is_measured = (
-        pose.xyz_yaw_cov is not None
-        and is_finite(pose.xyz_yaw_cov)
+        pose.level_frame_xyz_yaw_cov is not None
+        and is_finite(pose.level_frame_xyz_yaw_cov)
         and pose.tvec_m[2] >= LEAST_RANGE_M
     )
     if is_measured and before is not None and after is not None:
@@ -224,7 +224,7 @@ def consistency_rows(
     time minus `delay_s`, the probable delay. `velocity_mps` is the vehicle's velocity at that time,
     in world axes.
     """
-    assert pose.xyz_yaw_cov is not None
+    assert pose.level_frame_xyz_yaw_cov is not None
     T_body_cam = setup.T_body_cam
     R_body_cam = T_body_cam[:3, :3]
     x, y, z = (R_body_cam @ pose.tvec_m).tolist()  # vector from the camera, body axes
@@ -239,7 +239,7 @@ def consistency_rows(
         for p, q, v in zip(R0, R1, velocity_mps, strict=False)
     ]
     moves = _above(math.hypot(*speeds), math.hypot(NOISE_MPS, NOISE_RADPS * z))
-    aside_m2 = 0.5 * float(pose.xyz_yaw_cov[0, 0] + pose.xyz_yaw_cov[1, 1])
+    aside_m2 = 0.5 * float(pose.level_frame_xyz_yaw_cov[0, 0] + pose.level_frame_xyz_yaw_cov[1, 1])
     for i in (X, Y):
         at = before.position_m[i] + after.position_m[i] + _dot(R0[i], place) + _dot(R1[i], place)
         speed = moves * speeds[i]
@@ -252,7 +252,9 @@ def consistency_rows(
     rate *= _above(abs(rate), NOISE_RADPS)
     rows.append([heading0 + 0.5 * turned + delay_s * rate, rate] + 6 * [0.0])
     noise.append(
-        float(pose.xyz_yaw_cov[3, 3]) + LEAST_SIGMA_RAD**2 + (PICTURE_JITTER_S * rate) ** 2
+        float(pose.level_frame_xyz_yaw_cov[3, 3])
+        + LEAST_SIGMA_RAD**2
+        + (PICTURE_JITTER_S * rate) ** 2
     )
     return np.array(rows), np.array(noise), z
 

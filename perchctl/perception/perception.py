@@ -101,8 +101,8 @@ class Perception:
                 self._mirrored += 1
             elif output.detections.markers:
                 self._mirrored = 0
-            if output.is_foreign_target_seen:
-                self.refused = output.lock_note
+            if output.is_other_vehicles_target_seen:
+                self.refused = output.target_lock_message
             self._calibrate(output, used_s)
             yield picture, output
 

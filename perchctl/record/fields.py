@@ -221,7 +221,7 @@ def _output_values(output: PipelineOutput | None) -> dict[str, Any]:
     values: dict[str, Any] = {
         "frame": output.detections.frame_index,
         "frame_t_s": output.detections.t_s,
-        "lock_note": output.lock_note or None,
+        "lock_note": output.target_lock_message or None,
     }
     for marker in MARKERS:
         detection = output.detections.get(marker)

@@ -23,51 +23,54 @@ GreyImage = NDArray[np.uint8]
 
 # Minimum ratio of the energy of strong row differences between the two fields to that within the
 # fields. Fields displaced by one pixel exceed this ratio.
-_MIN_INTER_TO_INTRA_FIELD_ENERGY_RATIO = 1.4
+_MIN_INTER_TO_INTRA_FIELD_ENERGY_RATIO_IF_COMBED = 1.4
 # Number of rows per group. All rows of a group, except the outer two at each end, are compared with
 # their neighbours.
-_ROWS_PER_COMBING_GROUP = 8
+_ROWS_PER_GROUP_IN_COMBING_CHECK = 8
 # A pixel counts if its difference exceeds this multiple of the mean difference within the fields.
-_MIN_COUNTED_ROW_DIFFERENCE_TO_MEAN_RATIO = 5.0
-_MIN_COUNTED_ROW_DIFFERENCE_GREY = 8.0
+_MIN_ROW_DIFFERENCE_TO_MEAN_RATIO_FOR_COMBING_ENERGY = 5.0
+_MIN_ROW_DIFFERENCE_FOR_COMBING_ENERGY_GREY = 8.0
 # Energy per pixel of strong row differences that noise alone may cause.
-_NOISE_ENERGY_PER_PIXEL_GREY2 = 0.25
+_COMBING_NOISE_ENERGY_PER_PIXEL_GREY2 = 0.25
 _COMBING_CHECK_INTERVAL_FRAMES = 3
 # The position error of a horizontal edge in an interpolated field is the first value times exp(-k
 # s^2), where s is the standard deviation of the blur, px, and k the second value.
-_ALIASING_SIGMA_WITHOUT_BLUR_PX, _ALIASING_DECAY_PER_BLUR_PX2 = 0.8, 2.45
+_INTERPOLATED_EDGE_SIGMA_WITHOUT_BLUR_PX, _INTERPOLATED_EDGE_SIGMA_DECAY_PER_SQUARED_BLUR = (
+    0.8,
+    2.45,
+)
 # cubic interpolation at the midpoint
-_INTERPOLATION_TAPS = np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0
+_MISSING_ROW_CUBIC_INTERPOLATION_TAPS = np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0
 
 _NTSC_AND_PAL_FRAME_PERIODS_S = (1 / 30, 1 / 25)
 _FRAME_PERIOD_RANGE_ROUNDED_TO_NTSC_OR_PAL_S = (0.029, 0.045)
 _VALID_FRAME_PERIOD_RANGE_S = (0.004, 0.1)
 _MAX_STORED_FRAME_PERIODS = 25
-_MIN_LOST_FRAME_TO_MEDIAN_PERIOD_RATIO = 1.8
+_MIN_PERIOD_TO_MEDIAN_RATIO_TO_COUNT_AS_LOST_FRAME = 1.8
 # After a longer gap, s, the previous frame says nothing about the field order.
-_MAX_FIELD_ORDER_VOTE_GAP_S = 0.25
+_MAX_FRAME_GAP_TO_VOTE_ON_FIELD_ORDER_S = 0.25
 # The votes decide the field order if their sum exceeds this value. Each vote is at most 1, so the
 # decision takes at least two frames.
-_MIN_FIELD_ORDER_DECISION_VOTE_SUM = 1.0
+_MIN_VOTE_SUM_TO_DECIDE_FIELD_ORDER = 1.0
 # The sum is limited to this value so that a change of the field order is detected soon.
-_MAX_ABS_FIELD_ORDER_VOTE_SUM = 3.0
+_FIELD_ORDER_VOTE_SUM_CLAMP_MAGNITUDE = 3.0
 # A sum above this value reverses an earlier decision.
-_MIN_FIELD_ORDER_REVERSAL_VOTE_SUM = 1.0
+_MIN_OPPOSITE_VOTE_SUM_TO_REVERSE_FIELD_ORDER = 1.0
 
 
 def is_combed(image: GreyImage) -> bool:
     """True if the image (h, w) shows interlacing artefacts (combing): its rows differ more from the
     rows of the other field than from those of their own field."""
-    groups, width = len(image) // _ROWS_PER_COMBING_GROUP, image.shape[1]
+    groups, width = len(image) // _ROWS_PER_GROUP_IN_COMBING_CHECK, image.shape[1]
     if groups == 0:
         return False
     # Each group of rows is flattened, so the next image row begins `width` elements further on. It
     # is enough to check every third group.
-    flat = np.ascontiguousarray(image[: groups * _ROWS_PER_COMBING_GROUP]).reshape(
-        groups, _ROWS_PER_COMBING_GROUP * width
+    flat = np.ascontiguousarray(image[: groups * _ROWS_PER_GROUP_IN_COMBING_CHECK]).reshape(
+        groups, _ROWS_PER_GROUP_IN_COMBING_CHECK * width
     )[::3]
     above2, above, row, below, below2 = (
-        flat[:, k * width : (k + _ROWS_PER_COMBING_GROUP - 4) * width] for k in range(5)
+        flat[:, k * width : (k + _ROWS_PER_GROUP_IN_COMBING_CHECK - 4) * width] for k in range(5)
     )
     # Compute in place to keep the frame in the processor's cache for the next steps.
     other = cv2.addWeighted(above, 0.5, below, 0.5, 0.0)
@@ -75,16 +78,16 @@ def is_combed(image: GreyImage) -> bool:
     cv2.absdiff(row, other, other)
     cv2.absdiff(row, own, own)
     least = max(
-        _MIN_COUNTED_ROW_DIFFERENCE_TO_MEAN_RATIO * cv2.mean(own)[0],
-        _MIN_COUNTED_ROW_DIFFERENCE_GREY,
+        _MIN_ROW_DIFFERENCE_TO_MEAN_RATIO_FOR_COMBING_ENERGY * cv2.mean(own)[0],
+        _MIN_ROW_DIFFERENCE_FOR_COMBING_ENERGY_GREY,
     )
     energy = [
         cv2.norm(cv2.threshold(each, least, 0, cv2.THRESH_TOZERO, each)[1], cv2.NORM_L2SQR)
         for each in (other, own)
     ]
     return (
-        energy[0] / (energy[1] + _NOISE_ENERGY_PER_PIXEL_GREY2 * row.size)
-        > _MIN_INTER_TO_INTRA_FIELD_ENERGY_RATIO
+        energy[0] / (energy[1] + _COMBING_NOISE_ENERGY_PER_PIXEL_GREY2 * row.size)
+        > _MIN_INTER_TO_INTRA_FIELD_ENERGY_RATIO_IF_COMBED
     )
 
 
@@ -103,7 +106,11 @@ def interpolate_field(image: GreyImage, first_row: int) -> GreyImage:
     own = image[first_row::2]
     # Row k of the interpolation is between rows k and k + 1 of the field.
     between = cv2.filter2D(
-        own, -1, _INTERPOLATION_TAPS[:, None], anchor=(0, 1), borderType=cv2.BORDER_REPLICATE
+        own,
+        -1,
+        _MISSING_ROW_CUBIC_INTERPOLATION_TAPS[:, None],
+        anchor=(0, 1),
+        borderType=cv2.BORDER_REPLICATE,
     )
     result = image.copy()
     if first_row == 0:
@@ -119,8 +126,8 @@ def interpolated_field_edge_sigma_px(blur_sigma_px: float) -> float:
     interpolated field. It is due to aliasing, because a field only has every second row, and
     becomes smaller as the blur grows. `blur_sigma_px` is the standard deviation of the edge's blur,
     px."""
-    return _ALIASING_SIGMA_WITHOUT_BLUR_PX * math.exp(
-        -_ALIASING_DECAY_PER_BLUR_PX2 * blur_sigma_px * blur_sigma_px
+    return _INTERPOLATED_EDGE_SIGMA_WITHOUT_BLUR_PX * math.exp(
+        -_INTERPOLATED_EDGE_SIGMA_DECAY_PER_SQUARED_BLUR * blur_sigma_px * blur_sigma_px
     )
 
 
@@ -182,7 +189,7 @@ def deinterlace_frame(
             state,
             picture_kind=picture_kind,
             frames_since_combing_check=skipped,
-            frame_periods_s=frame_periods_s,
+            recent_frame_periods_s=frame_periods_s,
         ),
         frame,
     )
@@ -190,7 +197,7 @@ def deinterlace_frame(
         return state, (frame,)
     top, bottom = interpolate_fields(frame)
     early, late = (top, bottom) if state.is_top_field_first else (bottom, top)
-    apart_s = _estimate_frame_period_s(state.frame_periods_s) / 2.0
+    apart_s = _estimate_frame_period_s(state.recent_frame_periods_s) / 2.0
     return state, (
         replace(early, t_s=frame.t_s - apart_s / 2.0),
         replace(late, t_s=frame.t_s + apart_s / 2.0),
@@ -204,7 +211,9 @@ def _estimate_frame_period_s(frame_periods_s: tuple[float, ...]) -> float:
     # The receiver's own rate makes the periods vary: at 60 Hz, the frames of a 25 Hz camera arrive
     # 33 and 50 ms apart.
     period_s = mean(
-        p for p in frame_periods_s if p < _MIN_LOST_FRAME_TO_MEDIAN_PERIOD_RATIO * middle_s
+        p
+        for p in frame_periods_s
+        if p < _MIN_PERIOD_TO_MEDIAN_RATIO_TO_COUNT_AS_LOST_FRAME * middle_s
     )
     if (
         _FRAME_PERIOD_RANGE_ROUNDED_TO_NTSC_OR_PAL_S[0]
@@ -219,8 +228,8 @@ def _update_frame_periods_s(state: InterlacingState, frame: Frame) -> tuple[floa
     if state.last_frame_t_s is not None:
         gap_s = frame.t_s - state.last_frame_t_s
         if _VALID_FRAME_PERIOD_RANGE_S[0] < gap_s < _VALID_FRAME_PERIOD_RANGE_S[1]:
-            return (*state.frame_periods_s[1 - _MAX_STORED_FRAME_PERIODS :], gap_s)
-    return state.frame_periods_s
+            return (*state.recent_frame_periods_s[1 - _MAX_STORED_FRAME_PERIODS :], gap_s)
+    return state.recent_frame_periods_s
 
 
 def _vote_on_field_order(state: InterlacingState, frame: Frame) -> InterlacingState:
@@ -231,7 +240,7 @@ def _vote_on_field_order(state: InterlacingState, frame: Frame) -> InterlacingSt
     )
     near = (
         state.last_frame_t_s is not None
-        and 0.0 < frame.t_s - state.last_frame_t_s < _MAX_FIELD_ORDER_VOTE_GAP_S
+        and 0.0 < frame.t_s - state.last_frame_t_s < _MAX_FRAME_GAP_TO_VOTE_ON_FIELD_ORDER_S
     )
     if near and before is not None and before.shape == frame.image.shape:
         rows = (len(before) - 2) // 2 * 2
@@ -243,18 +252,18 @@ def _vote_on_field_order(state: InterlacingState, frame: Frame) -> InterlacingSt
         top_to_bottom = cv2.norm(high, bottoms[1][:-1], cv2.NORM_L2SQR)
         vote = (top_to_bottom - bottom_to_top) / max(top_to_bottom + bottom_to_top, 1.0)
         top_field_first_vote_sum = min(
-            max(top_field_first_vote_sum + vote, -_MAX_ABS_FIELD_ORDER_VOTE_SUM),
-            _MAX_ABS_FIELD_ORDER_VOTE_SUM,
+            max(top_field_first_vote_sum + vote, -_FIELD_ORDER_VOTE_SUM_CLAMP_MAGNITUDE),
+            _FIELD_ORDER_VOTE_SUM_CLAMP_MAGNITUDE,
         )
     if (
         is_top_field_first is None
-        and abs(top_field_first_vote_sum) > _MIN_FIELD_ORDER_DECISION_VOTE_SUM
+        and abs(top_field_first_vote_sum) > _MIN_VOTE_SUM_TO_DECIDE_FIELD_ORDER
     ):
         is_top_field_first = top_field_first_vote_sum > 0.0
     elif (
         is_top_field_first is not None
         and (top_field_first_vote_sum if not is_top_field_first else -top_field_first_vote_sum)
-        > _MIN_FIELD_ORDER_REVERSAL_VOTE_SUM
+        > _MIN_OPPOSITE_VOTE_SUM_TO_REVERSE_FIELD_ORDER
     ):
         is_top_field_first = not is_top_field_first
     return replace(

@@ -14,22 +14,29 @@ import numpy as np
 
 from perchctl.geometry import Array, circular_mean, wrap_rad
 from perchctl.profile import MergeConfig, WeightsConfig
-from perchctl.vision.filter import POSITION, VELOCITY, YAW, X, Y, Z
+from perchctl.vision.filter import (
+    POSITION_STATE_ELEMENTS,
+    VELOCITY_STATE_ELEMENTS,
+    X_STATE_INDEX,
+    Y_STATE_INDEX,
+    YAW_STATE_INDEX,
+    Z_STATE_INDEX,
+)
 from perchctl.vision.pose import PoseCandidate, PoseSetup, R_level_body_of, estimate_pose
 from perchctl.vision.types import (
     Detection,
     Detections,
+    FrameMarkerPoses,
+    MarkerFilterState,
     MarkerPose,
-    MarkerPoses,
-    MarkerTrack,
     VehicleState,
     VisibleMarkers,
 )
 
-MAX_CONSISTENT_CHI2_PER_DOF = 4.0
+MAX_JOINT_CHI2_PER_DOF_FOR_CONSISTENT_MARKERS = 4.0
 """If chi-squared per degree of freedom is below this value, the two markers do not contradict each
 other."""
-_XYZ_YAW_STATE_INDICES = [X, Y, Z, YAW]
+_XYZ_YAW_STATE_INDICES = [X_STATE_INDEX, Y_STATE_INDEX, Z_STATE_INDEX, YAW_STATE_INDEX]
 _VISIBLE_MARKERS_BY_POSE_SOURCE = {
     "joint": VisibleMarkers.BOTH,
     "large": VisibleMarkers.LARGE,
@@ -38,7 +45,7 @@ _VISIBLE_MARKERS_BY_POSE_SOURCE = {
 
 
 @dataclass(frozen=True, eq=False)
-class MergedTarget:
+class TargetMergedFromTracks:
     """The target's position, yaw and velocity, merged from the tracks of its markers. All are in
     the frame of the tracks: relative to the gear in level axes, or in the world frame of the state
     estimate.
@@ -71,7 +78,7 @@ def estimate_marker_poses(
     previous_target_normal_cam: Array | None,
     config: MergeConfig,
     setup: PoseSetup,
-) -> MarkerPoses:
+) -> FrameMarkerPoses:
     """Estimate the poses of the markers detected in one frame, and assign them to the tracks that
     they update: a single track ``joint``, or one track for each marker, depending on
     `config.method`. If the two markers contradict each other, only the more certain pose updates a
@@ -89,7 +96,7 @@ def estimate_marker_poses(
     joint = None
     if config.method == "joint" and len(seen) == 2:
         joint = estimate_pose(seen, t_s, attitude, setup, previous_target_normal_cam, start_pose)
-    clear = joint is not None and joint.chi2_per_dof < MAX_CONSISTENT_CHI2_PER_DOF
+    clear = joint is not None and joint.chi2_per_dof < MAX_JOINT_CHI2_PER_DOF_FOR_CONSISTENT_MARKERS
     enough = clear and config.stages == "seen"
     poses: dict[str, MarkerPose] = {} if joint is None else {"joint": joint}
     singles: dict[str, MarkerPose] = {}
@@ -101,56 +108,60 @@ def estimate_marker_poses(
                 singles[each.marker] = pose
     poses |= singles
     if joint is not None and enough:
-        return MarkerPoses(poses, {"joint": joint})
+        return FrameMarkerPoses(poses, {"joint": joint})
     do_markers_contradict = False
     if not clear and len(singles) == 2:
         do_markers_contradict = are_marker_positions_inconsistent(
             singles["large"], singles["small"], config.disagreement_m
         )
-    poses_by_track, one = dict(singles), joint
+    poses_by_updated_track, one = dict(singles), joint
     if len(singles) == 2:
         better = choose_more_certain_pose(singles["large"], singles["small"])
         one = joint or better
         if do_markers_contradict:
-            poses_by_track = {better.source: better}
+            poses_by_updated_track = {better.source: better}
         elif config.stages == "range":
             # Choose by the distance from the camera to the target's plane (equations 4, 6 and 11).
             offset = R_level_body_of(attitude) @ (setup.gear_body_m - setup.T_body_cam[:3, 3])
             z_m = float(better.e_m[2] + offset[2])
             if not config.z3_m < z_m <= config.z2_m:
-                del poses_by_track["small" if z_m > config.z2_m else "large"]
+                del poses_by_updated_track["small" if z_m > config.z2_m else "large"]
     if config.method == "joint":
-        one = next(iter(poses_by_track.values())) if len(poses_by_track) == 1 else one
-        poses_by_track = {} if one is None else {"joint": one}
-    return MarkerPoses(poses, poses_by_track, do_markers_contradict)
+        one = (
+            next(iter(poses_by_updated_track.values())) if len(poses_by_updated_track) == 1 else one
+        )
+        poses_by_updated_track = {} if one is None else {"joint": one}
+    return FrameMarkerPoses(poses, poses_by_updated_track, do_markers_contradict)
 
 
 def merge_tracks(
-    tracks: Mapping[str, MarkerTrack],
-    poses_by_track: Mapping[str, MarkerPose],
+    tracks: Mapping[str, MarkerFilterState],
+    poses_by_updated_track: Mapping[str, MarkerPose],
     weights: WeightsConfig,
-) -> MergedTarget | None:
+) -> TargetMergedFromTracks | None:
     """Return the target merged from its `tracks`, by name: ``joint``, or ``large`` and ``small``.
-    Only the tracks that this frame's poses (`poses_by_track`, with the same names) update are used
-    or, if there are none, the tracks that were measured last. A single track is used as it is. Two
-    are averaged, with `weights` for the large marker (`make_marker_weight_matrix`; equation 8 of
-    the paper). Returns None if there are no tracks."""
+    Only the tracks that this frame's poses (`poses_by_updated_track`, with the same names) update
+    are used or, if there are none, the tracks that were measured last. A single track is used as it
+    is. Two are averaged, with `weights` for the large marker (`make_marker_weight_matrix`; equation
+    8 of the paper). Returns None if there are no tracks."""
     if not tracks:
         return None
     least = min(track.unseen_frames for track in tracks.values())
     used = {name: track for name, track in tracks.items() if track.unseen_frames == least}
-    used = {name: track for name, track in used.items() if name in poses_by_track} or used
+    used = {name: track for name, track in used.items() if name in poses_by_updated_track} or used
     if len(used) == 1:
         ((name, track),) = used.items()
-        return MergedTarget(
+        return TargetMergedFromTracks(
             track_frame_xyz_yaw=track.x[_XYZ_YAW_STATE_INDICES],
-            track_frame_velocity_mps=track.x[VELOCITY],
-            track_frame_position_cov_m2=track.P[POSITION, POSITION],
-            track_frame_position_shift_per_bias_sigma_m=track.state_shift_per_bias_sigma[POSITION],
-            yaw_var_rad2=float(track.P[YAW, YAW]),
+            track_frame_velocity_mps=track.x[VELOCITY_STATE_ELEMENTS],
+            track_frame_position_cov_m2=track.P[POSITION_STATE_ELEMENTS, POSITION_STATE_ELEMENTS],
+            track_frame_position_shift_per_bias_sigma_m=track.state_shift_per_bias_sigma[
+                POSITION_STATE_ELEMENTS
+            ],
+            yaw_var_rad2=float(track.P[YAW_STATE_INDEX, YAW_STATE_INDEX]),
             unseen_frames=least,
-            stage=_VISIBLE_MARKERS_BY_POSE_SOURCE[poses_by_track[name].source]
-            if name in poses_by_track
+            stage=_VISIBLE_MARKERS_BY_POSE_SOURCE[poses_by_updated_track[name].source]
+            if name in poses_by_updated_track
             else VisibleMarkers.NONE,
         )
     large, small = used["large"], used["small"]
@@ -159,20 +170,23 @@ def merge_tracks(
     pairs = np.stack([np.diag(large.P)[order], np.diag(small.P)[order]], axis=1)
     variance = W2 @ pairs.ravel()
     w = np.array([weights.x, weights.y, weights.z])
-    return MergedTarget(
+    return TargetMergedFromTracks(
         track_frame_xyz_yaw=merge_xyz_yaw(large.x[order], small.x[order], weights),
-        track_frame_velocity_mps=w * large.x[VELOCITY] + (1.0 - w) * small.x[VELOCITY],
+        track_frame_velocity_mps=w * large.x[VELOCITY_STATE_ELEMENTS]
+        + (1.0 - w) * small.x[VELOCITY_STATE_ELEMENTS],
         track_frame_position_cov_m2=np.diag(variance[:3]),
         track_frame_position_shift_per_bias_sigma_m=w[:, None]
-        * large.state_shift_per_bias_sigma[POSITION]
-        + (1.0 - w[:, None]) * small.state_shift_per_bias_sigma[POSITION],
+        * large.state_shift_per_bias_sigma[POSITION_STATE_ELEMENTS]
+        + (1.0 - w[:, None]) * small.state_shift_per_bias_sigma[POSITION_STATE_ELEMENTS],
         yaw_var_rad2=float(variance[3]),
         unseen_frames=least,
-        stage=VisibleMarkers.BOTH if poses_by_track else VisibleMarkers.NONE,
+        stage=VisibleMarkers.BOTH if poses_by_updated_track else VisibleMarkers.NONE,
     )
 
 
-def widen_covariance_for_rival(merged: MergedTarget, rival_state: Array) -> MergedTarget:
+def widen_covariance_for_rival(
+    merged: TargetMergedFromTracks, rival_state: Array
+) -> TargetMergedFromTracks:
     """Increase the target's covariance so that it also covers the position of a rival: a
     target-like pattern, with the state `rival_state` (8,) in the frame of `merged`, whose position
     contradicts the target's track. If d is the difference between the two positions, the covariance
@@ -192,7 +206,7 @@ def widen_covariance_for_rival(merged: MergedTarget, rival_state: Array) -> Merg
 # frame's time.
 
 
-READOUT_TIME_SIGMA_IF_UNKNOWN_S = 0.012
+ROLLING_SHUTTER_READOUT_TIME_SIGMA_IF_UNKNOWN_S = 0.012
 """Standard deviation of a camera's rolling-shutter readout time, s, if the profile does not specify
 it."""
 CORNER_FLOW_SIGMA_FRACTION_ALONG_FLOW, CORNER_FLOW_SIGMA_FRACTION_ACROSS_FLOW = 0.05, 0.015
@@ -206,16 +220,17 @@ def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[De
     (`Detections.corner_flow_pxps`) times the delay of its row relative to the middle row. Markers
     without a known image velocity stay unchanged.
 
-    If the readout time `setup.readout_s` is None (unknown), the corners are not moved, and
-    `corner_shift_per_readout_sigma_px` is their possible shift for a readout time of 12 ms
-    (`READOUT_TIME_SIGMA_IF_UNKNOWN_S`). If it is 0, the detections are returned unchanged.
-    Otherwise the corners are moved, and `corner_shift_per_readout_sigma_px`, `sigma_px` and
-    `cov_px2` include the error of this correction.
+    If the readout time `setup.rolling_shutter_readout_s` is None (unknown), the corners are not
+    moved, and `corner_shift_per_readout_time_sigma_px` is their possible shift for a readout time
+    of 12 ms (`ROLLING_SHUTTER_READOUT_TIME_SIGMA_IF_UNKNOWN_S`). If it is 0, the detections are
+    returned unchanged. Otherwise the corners are moved, and
+    `corner_shift_per_readout_time_sigma_px`, `sigma_px` and `cov_px2` include the error of this
+    correction.
     """
-    readout_s, height_px = setup.readout_s, setup.camera.size_px[1]
+    readout_s, height_px = setup.rolling_shutter_readout_s, setup.camera.size_px[1]
     if readout_s == 0.0:
         return detections.markers
-    late = READOUT_TIME_SIGMA_IF_UNKNOWN_S if readout_s is None else readout_s
+    late = ROLLING_SHUTTER_READOUT_TIME_SIGMA_IF_UNKNOWN_S if readout_s is None else readout_s
     out = []
     for d in detections.markers:
         flow = detections.corner_flow_pxps.get(d.marker)
@@ -228,7 +243,7 @@ def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[De
         late_s = (d.corners_px[:, 1:] / (height_px - 1.0) - 0.5) * late
         moved_px = flow * late_s
         if readout_s is None:
-            out.append(replace(d, corner_shift_per_readout_sigma_px=moved_px))
+            out.append(replace(d, corner_shift_per_readout_time_sigma_px=moved_px))
         else:
             turned_px = CORNER_FLOW_SIGMA_FRACTION_ACROSS_FLOW * float(np.abs(moved_px).max())
             cov_px2 = None if d.cov_px2 is None else d.cov_px2 + turned_px**2 * np.eye(8)
@@ -238,7 +253,7 @@ def correct_rolling_shutter(detections: Detections, setup: PoseSetup) -> list[De
                     corners_px=d.corners_px - moved_px,
                     sigma_px=float(np.hypot(d.sigma_px, turned_px)),
                     cov_px2=cov_px2,
-                    corner_shift_per_readout_sigma_px=CORNER_FLOW_SIGMA_FRACTION_ALONG_FLOW
+                    corner_shift_per_readout_time_sigma_px=CORNER_FLOW_SIGMA_FRACTION_ALONG_FLOW
                     * moved_px,
                 )
             )
@@ -284,7 +299,7 @@ def are_marker_positions_inconsistent(
     errors shift both markers alike, so they do not increase the tolerance."""
     gap = np.abs(large.e_m - small.e_m)
     variance = [
-        np.maximum(p.sigma_m**2 - (p.shift_per_print_error_sigma_m**2).sum(axis=1), 0.0)
+        np.maximum(p.sigma_m**2 - (p.position_shift_per_print_error_sigma_m**2).sum(axis=1), 0.0)
         for p in (large, small)
     ]
     vague = 4.0 * np.sqrt(variance[0] + variance[1])

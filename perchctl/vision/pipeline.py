@@ -23,12 +23,16 @@ from perchctl.opencv_threads import one_thread
 from perchctl.profile import KalmanConfig, MergeConfig, Mounting, Profile, read_mask
 from perchctl.values import replace
 from perchctl.vision.fields import classify_interlacing, deinterlace_frame
-from perchctl.vision.filter import MAX_TRACK_GAP_S, make_filter_setup, predict_track
+from perchctl.vision.filter import (
+    MAX_FRAME_GAP_TO_CONTINUE_TRACK_S,
+    make_filter_setup,
+    predict_track,
+)
 from perchctl.vision.markers.cut import warm_up_truncated_marker_fit
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import DetectorSetup, make_detector_setup
 from perchctl.vision.merge import (
-    MergedTarget,
+    TargetMergedFromTracks,
     classify_visible_markers,
     estimate_marker_poses,
     merge_tracks,
@@ -36,15 +40,15 @@ from perchctl.vision.merge import (
 )
 from perchctl.vision.pose import PoseCandidate, PoseSetup, target_normal_cam
 from perchctl.vision.target_selection import (
-    OwnTargetPosition,
+    ExpectedOwnTargetPosition,
     gear_to_target_shift_per_bias_sigma_m,
     marker_to_own_target_distance_m,
     target_level_to_world,
     target_world_to_level,
 )
 from perchctl.vision.tracks import (
-    TrackedFrame,
     TrackSetup,
+    TrackUpdateResult,
     predict_corners,
     predict_rival_state,
     update_last_pose,
@@ -118,7 +122,7 @@ def make_pipeline(
         T_body_cam=profile.camera.mount.T_body_cam,
         gear_body_m=np.asarray(profile.vehicle.gear_body_m, dtype=np.float64),
         camera=camera,
-        readout_s=profile.camera.readout_s,
+        rolling_shutter_readout_s=profile.camera.readout_s,
     )
     mask = hidden_mask
     if mask is None and profile.camera.mask is not None:
@@ -130,18 +134,18 @@ def make_pipeline(
         warm_up_truncated_marker_fit(detector_setup.patterns, camera)
     target = profile.target
     # Without `target.expected_xy_m`, use the position at which the vehicle searches for the target.
-    own = OwnTargetPosition(profile.planner.approach_xy_m)
+    own = ExpectedOwnTargetPosition(profile.planner.approach_xy_m)
     if target.expected_xy_m is not None:
-        own = OwnTargetPosition(target.expected_xy_m, target.expected_within_m)
+        own = ExpectedOwnTargetPosition(target.expected_xy_m, target.expected_within_m)
     return Pipeline(
         detector_setup=detector_setup,
         pose_setup=pose_setup,
         merge=profile.merge,
         track_setup=TrackSetup(
-            level_filter=make_filter_setup(profile.kalman, is_world_frame=False),
-            world_filter=make_filter_setup(profile.kalman, is_world_frame=True),
+            level_frame_filter=make_filter_setup(profile.kalman, is_world_frame=False),
+            world_frame_filter=make_filter_setup(profile.kalman, is_world_frame=True),
             pose_setup=pose_setup,
-            is_gate_enabled=profile.kalman.gate,
+            is_innovation_gate_enabled=profile.kalman.gate,
             own_target=own,
         ),
         kalman=profile.kalman,
@@ -190,7 +194,7 @@ def step(
     """
     frame = classify_interlacing(_convert_to_grey(frame, pipeline.camera))
     expected_corners_px, start_pose = predict_corners(
-        state.last_pose, frame.t_s, attitude, pipeline.pose_setup
+        state.last_accepted_pose, frame.t_s, attitude, pipeline.pose_setup
     )
     if pipeline.custom_detector is not None:
         detections = _run_custom_detector(frame, pipeline.custom_detector)
@@ -199,9 +203,9 @@ def step(
         first = (
             state.last_detections is None
             and state.rival is None
-            and state.frames_without_markers == 0
+            and state.successive_frames_without_markers == 0
         )
-        empty = None if first else state.frames_without_markers
+        empty = None if first else state.successive_frames_without_markers
         own_target = pipeline.track_setup.own_target
         measure_marker_to_own_target_distance_m = partial(
             marker_to_own_target_distance_m, own_target, frame.t_s, attitude, pipeline.pose_setup
@@ -270,48 +274,54 @@ def step_from_detections(
     is the vehicle's state at the time of the detections; None if unknown. `start_pose` is the
     target's expected pose in the camera frame; None if unknown. `picture_kind` is passed on to the
     output: whether the image is a whole frame, interlaced, or a field."""
-    last_pose, t_s = state.last_pose, detections.t_s
+    last_accepted_pose, t_s = state.last_accepted_pose, detections.t_s
     normal = (
-        target_normal_cam(last_pose.pose) if last_pose is not None and attitude is None else None
+        target_normal_cam(last_accepted_pose.pose)
+        if last_accepted_pose is not None and attitude is None
+        else None
     )
     marker_poses = estimate_marker_poses(
         detections, attitude, start_pose, normal, pipeline.merge, pipeline.pose_setup
     )
 
     is_in_world_frame = pipeline.kalman.frame == "world" and attitude is not None
-    tracked_frame = update_tracks(
+    track_update = update_tracks(
         state, marker_poses, t_s, attitude, is_in_world_frame, pipeline.track_setup
     )
-    marker_poses, verdict = tracked_frame.marker_poses, tracked_frame.verdict
+    marker_poses, verdict = track_update.marker_poses, track_update.verdict
 
     stage = classify_visible_markers(detections.large is not None, detections.small is not None)
     anything = stage is not VisibleMarkers.NONE
-    disagreeing = state.frames_with_contradicting_markers
+    disagreeing = state.successive_frames_with_contradicting_markers
     if stage is VisibleMarkers.BOTH and verdict.is_accepted:
         disagreeing = disagreeing + 1 if marker_poses.do_markers_contradict else 0
     most_certain_pose = marker_poses.most_certain_pose
     sees = most_certain_pose is not None and verdict.is_accepted
     if most_certain_pose is not None and sees:
-        last_pose = update_last_pose(last_pose, most_certain_pose, attitude, pipeline.pose_setup)
+        last_accepted_pose = update_last_pose(
+            last_accepted_pose, most_certain_pose, attitude, pipeline.pose_setup
+        )
     target = _estimate_at_frame(
-        tracked_frame, state.target, t_s, attitude, is_in_world_frame, pipeline
+        track_update, state.target, t_s, attitude, is_in_world_frame, pipeline
     )
     last = state.last_detections
     if anything and verdict.is_accepted:
         last = detections
-    elif last is not None and not 0.0 <= t_s - last.t_s <= MAX_TRACK_GAP_S:
+    elif last is not None and not 0.0 <= t_s - last.t_s <= MAX_FRAME_GAP_TO_CONTINUE_TRACK_S:
         last = None
     new = PipelineState(
-        tracks=tracked_frame.tracks,
+        tracks=track_update.tracks,
         are_tracks_in_world_frame=is_in_world_frame,
         marker_poses=marker_poses,
         target=target or state.target,
         last_detections=last,
-        last_pose=last_pose if sees or tracked_frame.tracks else None,
-        frames_with_contradicting_markers=disagreeing,
-        frames_without_markers=0 if anything else state.frames_without_markers + 1,
-        lock=tracked_frame.lock,
-        rival=tracked_frame.rival,
+        last_accepted_pose=last_accepted_pose if sees or track_update.tracks else None,
+        successive_frames_with_contradicting_markers=disagreeing,
+        successive_frames_without_markers=0
+        if anything
+        else state.successive_frames_without_markers + 1,
+        lock=track_update.lock,
+        rival=track_update.rival,
         interlacing_state=state.interlacing_state,
     )
     output = PipelineOutput(
@@ -319,10 +329,11 @@ def step_from_detections(
         poses=marker_poses.poses_by_source,
         target=target,
         stage=stage,
-        frames_with_contradicting_markers=disagreeing,
-        lock_note=verdict.reason or (SEVERAL_TARGETS_TEXT if detections.target_count > 1 else ""),
+        successive_frames_with_contradicting_markers=disagreeing,
+        target_lock_message=verdict.reason
+        or (SEVERAL_TARGETS_TEXT if detections.target_count > 1 else ""),
         picture_kind=picture_kind,
-        is_foreign_target_seen=verdict.is_foreign_target,
+        is_other_vehicles_target_seen=verdict.is_other_vehicles_target,
     )
     return new, output
 
@@ -346,9 +357,11 @@ def estimate(
     if target is None or attitude is None or target.world_m is None:
         return target
     if state.tracks and state.are_tracks_in_world_frame:
-        world = pipeline.track_setup.world_filter
+        world = pipeline.track_setup.world_frame_filter
         tracks = {n: predict_track(t, t_s, world) for n, t in state.tracks.items()}
-        merged = merge_tracks(tracks, state.marker_poses.poses_by_track, pipeline.merge.weights)
+        merged = merge_tracks(
+            tracks, state.marker_poses.poses_by_updated_track, pipeline.merge.weights
+        )
         assert merged is not None
         rival = predict_rival_state(state.lock, state.rival, True, t_s, world)
         merged = merged if rival is None else widen_covariance_for_rival(merged, rival)
@@ -376,23 +389,26 @@ def estimate(
 
 
 def _estimate_at_frame(
-    tracked_frame: TrackedFrame,
+    track_update: TrackUpdateResult,
     previous_estimate: TargetEstimate | None,
     t_s: float,
     attitude: VehicleState | None,
     is_in_world_frame: bool,
     pipeline: Pipeline,
 ) -> TargetEstimate | None:
-    poses_by_track, tracks = tracked_frame.marker_poses.poses_by_track, tracked_frame.tracks
-    merged = merge_tracks(tracks, poses_by_track, pipeline.merge.weights)
+    poses_by_updated_track, tracks = (
+        track_update.marker_poses.poses_by_updated_track,
+        track_update.tracks,
+    )
+    merged = merge_tracks(tracks, poses_by_updated_track, pipeline.merge.weights)
     if merged is None:
         return None
     filter_setup = pipeline.track_setup.select_filter(is_in_world_frame)
     rival = predict_rival_state(
-        tracked_frame.lock, tracked_frame.rival, is_in_world_frame, t_s, filter_setup
+        track_update.lock, track_update.rival, is_in_world_frame, t_s, filter_setup
     )
     merged = merged if rival is None else widen_covariance_for_rival(merged, rival)
-    measured = any(n in tracks and tracks[n].t_s == t_s for n in poses_by_track)
+    measured = any(n in tracks and tracks[n].t_s == t_s for n in poses_by_updated_track)
     small = measured and merged.stage in (VisibleMarkers.BOTH, VisibleMarkers.SMALL)
     never = -np.inf
     frames = _express_in_level_and_world(merged, attitude, is_in_world_frame, pipeline)
@@ -426,7 +442,7 @@ def _estimate_at_frame(
 
 
 def _express_in_level_and_world(
-    merged: MergedTarget,
+    merged: TargetMergedFromTracks,
     attitude: VehicleState | None,
     is_in_world_frame: bool,
     pipeline: Pipeline,
@@ -447,7 +463,7 @@ def _express_in_level_and_world(
         seen["world_velocity_mps"] = merged.track_frame_velocity_mps
         position_cov_m2 = turn.dot(position_cov_m2).dot(turn.T)
         error_shifts_m = gear_to_target_shift_per_bias_sigma_m(
-            error_shifts_m, attitude, pipeline.track_setup.world_filter, pipeline.pose_setup
+            error_shifts_m, attitude, pipeline.track_setup.world_frame_filter, pipeline.pose_setup
         )
     else:
         seen["e_m"], seen["e_yaw_rad"] = place_m, yaw_rad

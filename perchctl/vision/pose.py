@@ -23,14 +23,14 @@ from perchctl.vision.lens import undistort_px
 from perchctl.vision.types import CameraModel, Detection, MarkerPose, VehicleState
 
 # Combined error of the mounting, the attitude estimate and the ceiling.
-_TILT_FROM_ATTITUDE_SIGMA_RAD = math.radians(6.0)
+_TILT_PRIOR_SIGMA_FROM_ATTITUDE_RAD = math.radians(6.0)
 # Change of the tilt between two frames.
-_TILT_FROM_PREVIOUS_POSE_SIGMA_RAD = math.radians(10.0)
+_TILT_PRIOR_SIGMA_FROM_PREVIOUS_POSE_RAD = math.radians(10.0)
 # If the corners of both markers on a flat sheet have a larger chi-squared per degree of freedom,
 # the sheet may be curled.
-_MIN_CHI2_PER_DOF_FOR_SHEET_CURL = 3.0
+_MIN_CHI2_PER_DOF_TO_TRY_SHEET_CURL = 3.0
 # If curl is the cause, at most this fraction of chi-squared remains after allowing for it.
-_MAX_REMAINING_CHI2_FRACTION_WITH_SHEET_CURL = 0.5
+_MAX_CURLED_TO_FLAT_CHI2_RATIO_TO_ACCEPT_CURL = 0.5
 _PoseSource = Literal["large", "small", "joint"]
 
 
@@ -38,15 +38,15 @@ _PoseSource = Literal["large", "small", "joint"]
 class PoseSetup:
     """Parameters of pose estimation. `T_body_cam` (4, 4) is the camera mounting, the pose of the
     camera in body axes, `gear_body_m` (3,) the position of the gear's tip in body axes, and
-    `readout_s` the rolling-shutter readout time from the first to the last image row (None if
-    unknown)."""
+    `rolling_shutter_readout_s` the rolling-shutter readout time from the first to the last image
+    row (None if unknown)."""
 
     config: PoseConfig
     target: TargetConfig
     T_body_cam: Array
     gear_body_m: Array
     camera: CameraModel
-    readout_s: float | None = 0.0
+    rolling_shutter_readout_s: float | None = 0.0
 
     @cached_property
     def marker_corners_m(self) -> dict[_PoseSource, Array]:
@@ -116,9 +116,9 @@ def estimate_pose(
     R_level_body = R_level_body_of(attitude)
     if attitude is not None:
         R_level_cam = R_level_body.dot(setup.T_body_cam[:3, :3])
-        prior = TiltPrior(-R_level_cam[2], _TILT_FROM_ATTITUDE_SIGMA_RAD)
+        prior = TiltPrior(-R_level_cam[2], _TILT_PRIOR_SIGMA_FROM_ATTITUDE_RAD)
     else:
-        prior = TiltPrior(previous_target_normal_cam, _TILT_FROM_PREVIOUS_POSE_SIGMA_RAD)
+        prior = TiltPrior(previous_target_normal_cam, _TILT_PRIOR_SIGMA_FROM_PREVIOUS_POSE_RAD)
     max_rms_reprojection_px = setup.config.max_reprojection_px
     solution = _refine_from_start(points, start, prior, max_rms_reprojection_px) or solve_pose(
         points, prior
@@ -128,11 +128,11 @@ def estimate_pose(
     pose = _make_marker_pose(source, t_s, solution, points, R_level_body, setup)
     if (
         source != "joint"
-        or pose.chi2_per_dof < _MIN_CHI2_PER_DOF_FOR_SHEET_CURL
+        or pose.chi2_per_dof < _MIN_CHI2_PER_DOF_TO_TRY_SHEET_CURL
         or setup.target.curl_per_m == 0.0
     ):
         return pose
-    if any(d.horizontal_side_extra_sigma_px > 0.0 for d in detections):
+    if any(d.horizontal_side_deinterlacing_sigma_px > 0.0 for d in detections):
         return pose  # Interpolated rows make the sides look curled.
     # No flat sheet explains the positions of both markers. Either the sheet is curled, or the
     # corners are wrong.
@@ -143,7 +143,7 @@ def estimate_pose(
     bent = _make_marker_pose(source, t_s, settled, points, R_level_body, setup)
     return (
         replace(bent, chi2_per_dof=pose.chi2_per_dof)
-        if bent.chi2_per_dof < _MAX_REMAINING_CHI2_FRACTION_WITH_SHEET_CURL * pose.chi2_per_dof
+        if bent.chi2_per_dof < _MAX_CURLED_TO_FLAT_CHI2_RATIO_TO_ACCEPT_CURL * pose.chi2_per_dof
         else pose
     )
 
@@ -202,8 +202,8 @@ def _make_marker_pose(
         sigma_yaw_rad=float(sigma[3]),
         rms_reprojection_px=solution.rms_reprojection_px,
         chi2_per_dof=chi2,
-        xyz_yaw_cov=cov_e,
-        shift_per_print_error_sigma_m=print_shift_m,
+        level_frame_xyz_yaw_cov=cov_e,
+        position_shift_per_print_error_sigma_m=print_shift_m,
         rvec_tvec_cov=cov,
     )
 
@@ -251,7 +251,7 @@ def _yaw_gradient_wrt_rvec(R_level_cam: Array, R_level_target: Array, dR_drvec: 
 # --- Rotation and translation from corners: a closed form, then weighted least squares ---
 
 
-_MIN_ANGLE_BETWEEN_SOLUTIONS_RAD = math.radians(
+_MIN_ANGLE_TO_COUNT_AS_DISTINCT_POSES_RAD = math.radians(
     2.0
 )  # Two solutions that are closer together count as one.
 _MIN_CORNER_SIGMA_IN_POSE_COST_PX = 0.05  # Lens and print errors make smaller values meaningless.
@@ -262,10 +262,10 @@ _CORNER_SIGMA_PRIOR_DOF = 8.0
 
 # A step is small enough for the errors to be linear if it reduces the cost by less than the first
 # value and changes each element of the pose, in rad or m, by less than the second one.
-_MAX_LINEARISED_COST_REDUCTION, _MAX_LINEARISED_STEP_RAD_OR_M = 1.0, 0.005
+_MAX_COST_REDUCTION_OF_LINEAR_STEP, _MAX_POSE_CHANGE_OF_LINEAR_STEP_RAD_OR_M = 1.0, 0.005
 # A larger reduction is also allowed if no corner moves further than this. The nonlinearity is about
 # the squared motion divided by the distance between corners, which is 20 px or more.
-_MAX_LINEARISED_MOTION_PX = 0.3
+_MAX_CORNER_MOTION_OF_LINEAR_STEP_PX = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,10 +363,10 @@ def refine_pose(points: WeightedCorners, start: PoseCandidate) -> ScoredPose | N
         gain = float(step.dot(g))
         moved_px = scored.reprojection_jacobian.dot(step).reshape(-1, 2)
         small = (
-            gain < _MAX_LINEARISED_COST_REDUCTION
-            or float(np.abs(moved_px).max()) < _MAX_LINEARISED_MOTION_PX
+            gain < _MAX_COST_REDUCTION_OF_LINEAR_STEP
+            or float(np.abs(moved_px).max()) < _MAX_CORNER_MOTION_OF_LINEAR_STEP_PX
         )
-        if small and max(map(abs, step.tolist())) < _MAX_LINEARISED_STEP_RAD_OR_M:
+        if small and max(map(abs, step.tolist())) < _MAX_POSE_CHANGE_OF_LINEAR_STEP_RAD_OR_M:
             # The errors are linear for a step of this size.
             reprojection_error_px = scored.reprojection_error_px - moved_px
             rvec, tvec = scored.rvec_rad - step[:3], scored.tvec_m - step[3:]
@@ -491,7 +491,7 @@ def _find_flipped_candidates(scored: ScoredPose, points: WeightedCorners) -> lis
     axis = np.cross(normal, other)
     sine, cosine = float(np.linalg.norm(axis)), float(normal @ other)
     angle = math.atan2(sine, cosine)
-    if angle < _MIN_ANGLE_BETWEEN_SOLUTIONS_RAD or sine < 1e-9:
+    if angle < _MIN_ANGLE_TO_COUNT_AS_DISTINCT_POSES_RAD or sine < 1e-9:
         return []
     rvec = rotation_vector(rotation_matrix(axis / sine * angle) @ R)
     turned = _refine_unweighted(points, PoseCandidate(rvec, scored.tvec_m))
@@ -595,9 +595,9 @@ class WeightedCorners:
         whitened_corner_shift_per_common_error_sigma: whitened shift of the corners for one standard
             deviation of each error that is common to several corners, one column per error (2n, k).
             These errors are the remaining shift of all black-white edges (blooming, gamma), the
-            error of the rolling-shutter readout time (`corner_shift_per_readout_sigma_px` of the
-            detections), and the horizontal jitter of image rows in each detection, which has two
-            columns.
+            error of the rolling-shutter readout time (`corner_shift_per_readout_time_sigma_px` of
+            the detections), and the horizontal jitter of image rows in each detection, which has
+            two columns.
         corner_lift_per_sheet_curl_sigma_m: result (2n, 2) of `corner_lift_by_sheet_curl`.
         allows_for_sheet_curl: True if the sheet may be curled, which reduces the weight of corners
             that curl would move; False if the sheet is assumed to be flat.
@@ -647,7 +647,7 @@ def compute_corner_weights(
         elif d.are_corners_fitted:
             spread_px = (
                 d.sigma_px
-                if d.horizontal_side_extra_sigma_px == 0.0
+                if d.horizontal_side_deinterlacing_sigma_px == 0.0
                 else _side_sigma_px(d, corners)
             )
             own = np.zeros(64)
@@ -655,8 +655,8 @@ def compute_corner_weights(
             W[rows, rows] = own.reshape(8, 8)
         else:
             W[rows, rows] = _IDENTITY_8 / d.sigma_px
-        if d.corner_shift_per_readout_sigma_px is not None:
-            error_shifts[rows, 1] = d.corner_shift_per_readout_sigma_px.ravel()
+        if d.corner_shift_per_readout_time_sigma_px is not None:
+            error_shifts[rows, 1] = d.corner_shift_per_readout_time_sigma_px.ravel()
         if d.row_jitter_sigma_px > 0.0:
             # As with a fitted line, the errors are a common shift of the rows (half the standard
             # deviation) and a tilt. Together, the two reach the whole standard deviation in the
@@ -701,7 +701,7 @@ def _side_sigma_px(detection: Detection, corners: Array) -> Array:
     return np.asarray(
         np.hypot(
             detection.sigma_px,
-            detection.horizontal_side_extra_sigma_px * lying / np.hypot(1.0, rows),
+            detection.horizontal_side_deinterlacing_sigma_px * lying / np.hypot(1.0, rows),
         )
     )
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from perchctl.geometry import Array, is_finite, wrap_rad
 from perchctl.vision.filter import (
-    PRINT_BIAS_COLUMNS,
-    TILT_BIAS_COLUMNS,
+    PRINT_SIZE_CURL_BIAS_COLUMNS,
+    ROLL_PITCH_BIAS_COLUMNS,
     FilterSetup,
     TrackMeasurement,
     vector_jacobian_wrt_tilt,
@@ -25,18 +25,18 @@ from perchctl.vision.filter import (
 from perchctl.vision.pose import PoseSetup, estimate_pose
 from perchctl.vision.types import Detection, MarkerName, MarkerPose, VehicleState
 
-_RAW_CORNER_SIGMA_PX = 1.0  # for corners that a search has found, before refinement
+_UNREFINED_CORNER_SIGMA_PX = 1.0  # for corners that a search has found, before refinement
 
 
 @dataclass(frozen=True)
-class OwnTargetPosition:
+class ExpectedOwnTargetPosition:
     """Expected horizontal position of the vehicle's own target, `xy_world_m` (x, y), in the world
     frame of the state estimate. If it is None (unknown), the target closest to the vertical axis
     through the gear is selected. A target whose horizontal distance from a known position is more
-    than `max_distance_m` belongs to another vehicle."""
+    than `max_distance_to_accept_target_m` belongs to another vehicle."""
 
     xy_world_m: tuple[float, float] | None = None
-    max_distance_m: float = math.inf
+    max_distance_to_accept_target_m: float = math.inf
 
 
 MarkerToOwnTargetDistanceFunction = Callable[[MarkerName, Array], float]
@@ -44,13 +44,14 @@ MarkerToOwnTargetDistanceFunction = Callable[[MarkerName, Array], float]
 the position of the vehicle's own target, or infinity if the marker is too far away."""
 
 
-_ASSUMED_DISTANCE_WITHOUT_POSE_M = 1e9
+_ASSUMED_MARKER_DISTANCE_WITHOUT_POSE_M = 1e9
 """Distance, m, that is assumed for corners that yield no pose yet, for example next to a highlight.
-Such a marker is considered last, but not rejected unless `own_target.max_distance_m` applies."""
+Such a marker is considered last, but not rejected unless
+`own_target.max_distance_to_accept_target_m` applies."""
 
 
 def marker_to_own_target_distance_m(
-    own_target: OwnTargetPosition,
+    own_target: ExpectedOwnTargetPosition,
     t_s: float,
     attitude: VehicleState | None,
     setup: PoseSetup,
@@ -62,23 +63,31 @@ def marker_to_own_target_distance_m(
     is unknown. `t_s` and `attitude` are those of the frame.
 
     The marker's position follows from a pose estimated from its corners. If they yield no pose, the
-    distance is assumed to be 1e9 m (`_ASSUMED_DISTANCE_WITHOUT_POSE_M`), so that a search chooses
-    this marker last. If `attitude` is known, distances above `own_target.max_distance_m`, including
-    the assumed one, become infinite, so that a search rejects the marker.
+    distance is assumed to be 1e9 m (`_ASSUMED_MARKER_DISTANCE_WITHOUT_POSE_M`), so that a search
+    chooses this marker last. If `attitude` is known, distances above
+    `own_target.max_distance_to_accept_target_m`, including the assumed one, become infinite, so
+    that a search rejects the marker.
     """
-    seen = Detection(marker, corners_px, _RAW_CORNER_SIGMA_PX, are_corners_fitted=False)
+    seen = Detection(marker, corners_px, _UNREFINED_CORNER_SIGMA_PX, are_corners_fitted=False)
     pose = estimate_pose([seen], t_s, attitude, setup)
     distance_m = (
-        _ASSUMED_DISTANCE_WITHOUT_POSE_M
+        _ASSUMED_MARKER_DISTANCE_WITHOUT_POSE_M
         if pose is None
         else horizontal_distance_to_own_target_m(pose, attitude, own_target, setup)
     )
-    is_bounded = attitude is not None and math.isfinite(own_target.max_distance_m)
-    return distance_m if not is_bounded or distance_m <= own_target.max_distance_m else math.inf
+    is_bounded = attitude is not None and math.isfinite(own_target.max_distance_to_accept_target_m)
+    return (
+        distance_m
+        if not is_bounded or distance_m <= own_target.max_distance_to_accept_target_m
+        else math.inf
+    )
 
 
 def horizontal_distance_to_own_target_m(
-    pose: MarkerPose, attitude: VehicleState | None, own_target: OwnTargetPosition, setup: PoseSetup
+    pose: MarkerPose,
+    attitude: VehicleState | None,
+    own_target: ExpectedOwnTargetPosition,
+    setup: PoseSetup,
 ) -> float:
     """Return the horizontal distance, m, of a detected target from the position of the vehicle's
     own target, or from the gear if this position or the vehicle's attitude is unknown."""
@@ -88,20 +97,25 @@ def horizontal_distance_to_own_target_m(
     return math.hypot(seen_m[0] - own_target.xy_world_m[0], seen_m[1] - own_target.xy_world_m[1])
 
 
-def foreign_target_message(
-    pose: MarkerPose, attitude: VehicleState | None, own_target: OwnTargetPosition, setup: PoseSetup
+def other_vehicles_target_message(
+    pose: MarkerPose,
+    attitude: VehicleState | None,
+    own_target: ExpectedOwnTargetPosition,
+    setup: PoseSetup,
 ) -> str | None:
-    """Return a message if the target with this pose is further than `own_target.max_distance_m`
-    from the known position of the vehicle's own target, so that it belongs to another vehicle. None
-    if it may be the vehicle's own, or if that position or the vehicle's attitude is unknown."""
+    """Return a message if the target with this pose is further than
+    `own_target.max_distance_to_accept_target_m` from the known position of the vehicle's own
+    target, so that it belongs to another vehicle. None if it may be the vehicle's own, or if that
+    position or the vehicle's attitude is unknown."""
     if attitude is None or own_target.xy_world_m is None:
         return None
     distance_m = horizontal_distance_to_own_target_m(pose, attitude, own_target, setup)
-    if distance_m <= own_target.max_distance_m:
+    if distance_m <= own_target.max_distance_to_accept_target_m:
         return None
     return (
         f"a target {distance_m:.2f} m from target.expected_xy_m is ignored "
-        f"(target.expected_within_m is {own_target.max_distance_m:g} m)"
+        f"(target.expected_within_m is "
+        f"{own_target.max_distance_to_accept_target_m:g} m)"
     )
 
 
@@ -172,14 +186,18 @@ def make_track_measurement(
         lever_m = pose.e_m + attitude.R_level_body.dot(setup.gear_body_m)
         z[0] = wrap_rad(pose.e_yaw_rad + attitude.yaw_rad)
         z[1:] = attitude.R_world_level.dot(lever_m) + attitude.position_m
-    if filter_setup.acceleration_process_noise is None or pose.xyz_yaw_cov is None:
+    if filter_setup.acceleration_process_noise is None or pose.level_frame_xyz_yaw_cov is None:
         return TrackMeasurement(z)
-    noise = pose.xyz_yaw_cov.copy()
-    noise[:3, :3] -= pose.shift_per_print_error_sigma_m.dot(pose.shift_per_print_error_sigma_m.T)
+    noise = pose.level_frame_xyz_yaw_cov.copy()
+    noise[:3, :3] -= pose.position_shift_per_print_error_sigma_m.dot(
+        pose.position_shift_per_print_error_sigma_m.T
+    )
     shift_per_bias_sigma = np.zeros((4, 4))
-    shift_per_bias_sigma[1:, PRINT_BIAS_COLUMNS] = pose.shift_per_print_error_sigma_m
+    shift_per_bias_sigma[1:, PRINT_SIZE_CURL_BIAS_COLUMNS] = (
+        pose.position_shift_per_print_error_sigma_m
+    )
     if attitude is not None:
-        shift_per_bias_sigma[1:, TILT_BIAS_COLUMNS] = (
+        shift_per_bias_sigma[1:, ROLL_PITCH_BIAS_COLUMNS] = (
             vector_jacobian_wrt_tilt(lever_m) * filter_setup.roll_pitch_bias_sigma_rad
         )
     if is_in_world_frame and attitude is not None:
@@ -207,7 +225,7 @@ def gear_to_target_shift_per_bias_sigma_m(
     minus the effect of the roll and pitch biases on the gear."""
     gear_level = attitude.R_level_body.dot(setup.gear_body_m)
     moved = attitude.R_world_level.T.dot(target_world_shift_per_bias_sigma_m)
-    moved[:, TILT_BIAS_COLUMNS] -= (
+    moved[:, ROLL_PITCH_BIAS_COLUMNS] -= (
         vector_jacobian_wrt_tilt(gear_level) * filter_setup.roll_pitch_bias_sigma_rad
     )
     return np.asarray(moved)

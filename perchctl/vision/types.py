@@ -19,7 +19,7 @@ MarkerName = Literal["large", "small"]
 PictureKind = Literal["whole", "woven", "top", "bottom"]
 MARKERS: tuple[MarkerName, MarkerName] = ("large", "small")
 """The target's markers, the large one first."""
-GearToTargetInLevel = Array
+GearToTargetVectorInLevelFrame = Array
 """A vector (3,) from the gear to the target in level axes, m: the paper's (e_x, e_y, e_z)."""
 
 
@@ -157,7 +157,7 @@ class Detection:
         remaining_edge_shift_sigma_px: standard deviation of the distance by which all edges of the
             marker may still be shifted outwards or inwards (blooming, gamma), after a correction
             or without one.
-        corner_shift_per_readout_sigma_px: change (4, 2) of the corners, px, for one standard
+        corner_shift_per_readout_time_sigma_px: change (4, 2) of the corners, px, for one standard
             deviation of the error of the rolling-shutter readout time, which is common to both
             markers; None if this error is not considered.
         cov_px2: covariance (8, 8) of corners that were inferred from a visible part of the marker
@@ -165,8 +165,9 @@ class Detection:
             x1, y1, ...; None for corners from other methods.
         row_jitter_sigma_px: standard deviation of the corners along x, because analogue video
             shifts each image row horizontally by a random distance (row jitter).
-        horizontal_side_extra_sigma_px: additional standard deviation of the position of horizontal
-            sides, perpendicular to the side, if every second row of the image is interpolated.
+        horizontal_side_deinterlacing_sigma_px: additional standard deviation of the position of
+            horizontal sides, perpendicular to the side, if every second row of the image is
+            interpolated.
     """
 
     marker: MarkerName
@@ -174,14 +175,14 @@ class Detection:
     sigma_px: float
     are_corners_fitted: bool
     remaining_edge_shift_sigma_px: float = 0.0
-    corner_shift_per_readout_sigma_px: Array | None = None
+    corner_shift_per_readout_time_sigma_px: Array | None = None
     cov_px2: Array | None = None
     row_jitter_sigma_px: float = 0.0
-    horizontal_side_extra_sigma_px: float = 0.0
+    horizontal_side_deinterlacing_sigma_px: float = 0.0
 
 
 @dataclass(frozen=True)
-class EdgeShift:
+class EdgeShiftEstimate:
     """Common shift of all black-white edges of an image, due to blooming or gamma.
 
     `white_growth_per_edge_px` is the distance by which each edge is displaced from the white side
@@ -219,7 +220,7 @@ class Detections:
     is_mirrored_marker_seen: bool = False
     target_count: int = 0
     corner_flow_pxps: dict[MarkerName, Array] = field(default_factory=dict)
-    edge_shift: EdgeShift | None = None
+    edge_shift: EdgeShiftEstimate | None = None
 
     def get(self, marker: MarkerName) -> Detection | None:
         """Return the marker's detection; None if it was not detected."""
@@ -277,10 +278,11 @@ class MarkerPose:
         rms_reprojection_px: RMS distance between the projected and the measured corners.
         chi2_per_dof: sum of the squared errors of the corners divided by their variances, per
             degree of freedom.
-        xyz_yaw_cov: covariance (4, 4) of (e_x, e_y, e_z, e_yaw), m and rad; None if unknown.
-        shift_per_print_error_sigma_m: shift (3, 2) of `e_m` for one standard deviation of the
-            print's size error (column 0) and of the sheet's curl (column 1). These errors are
-            included in `sigma_m` and `xyz_yaw_cov`, but are the same in every frame.
+        level_frame_xyz_yaw_cov: covariance (4, 4) of (e_x, e_y, e_z, e_yaw), m and rad; None if
+            unknown.
+        position_shift_per_print_error_sigma_m: shift (3, 2) of `e_m` for one standard deviation of
+            the print's size error (column 0) and of the sheet's curl (column 1). These errors are
+            included in `sigma_m` and `level_frame_xyz_yaw_cov`, but are the same in every frame.
         rvec_tvec_cov: covariance (6, 6) of (rvec_rad, tvec_m), without these print errors; None if
             unknown.
     """
@@ -289,19 +291,19 @@ class MarkerPose:
     t_s: float
     rvec_rad: Array
     tvec_m: Array
-    e_m: GearToTargetInLevel
+    e_m: GearToTargetVectorInLevelFrame
     e_yaw_rad: float
     sigma_m: Array
     sigma_yaw_rad: float
     rms_reprojection_px: float
     chi2_per_dof: float = 0.0
-    xyz_yaw_cov: Array | None = None
-    shift_per_print_error_sigma_m: Array = field(default_factory=lambda: np.zeros((3, 2)))
+    level_frame_xyz_yaw_cov: Array | None = None
+    position_shift_per_print_error_sigma_m: Array = field(default_factory=lambda: np.zeros((3, 2)))
     rvec_tvec_cov: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class MarkerTrack:
+class MarkerFilterState:
     """State of a marker's Kalman filter (paper, section II-A.1).
 
     The state `x` (8,) contains yaw, yaw rate, then position and velocity of x, y, z, in SI units,
@@ -367,7 +369,7 @@ class TargetEstimate:
     is_measured_in_newest_frame: bool
     tracked: bool
     unseen_frames: int
-    e_m: GearToTargetInLevel
+    e_m: GearToTargetVectorInLevelFrame
     e_yaw_rad: float
     velocity_mps: Array
     sigma_m: Array
@@ -379,30 +381,33 @@ class TargetEstimate:
     measured_gear_to_target_sigma_m: float = math.inf
 
 
-class MotionErrors(NamedTuple):
+class TargetBearingPredictionErrors(NamedTuple):
     """Running mean squared errors, rad^2, of the vehicle's estimated motion between two poses of
     the target: one for the motion computed from the difference of two estimated positions, and one
     for the motion computed from velocity times time. An error is the angle, seen from the camera,
     between the predicted and the measured direction of the target."""
 
-    position_based_mean_squared_bearing_error_rad2: float = 0.0
-    velocity_based_mean_squared_bearing_error_rad2: float = 0.0
+    mean_squared_error_using_positions_rad2: float = 0.0
+    mean_squared_error_using_velocities_rad2: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
-class LastPose:
+class LastAcceptedPose:
     """The last accepted pose of the target, the vehicle's attitude, position and velocity at that
-    time (`attitude`, None if unknown), and the mean squared errors of the vehicle's motion between
-    poses. There is one error for the motion computed from positions and one for the motion computed
-    from velocities; the smaller error has more weight in the prediction of the next pose."""
+    time (`vehicle_state`, None if unknown), and the mean squared errors of the vehicle's motion
+    between poses. There is one error for the motion computed from positions and one for the motion
+    computed from velocities; the smaller error has more weight in the prediction of the next
+    pose."""
 
     pose: MarkerPose
-    attitude: VehicleState | None
-    motion_errors: MotionErrors = field(default_factory=MotionErrors)
+    vehicle_state: VehicleState | None
+    bearing_prediction_errors: TargetBearingPredictionErrors = field(
+        default_factory=TargetBearingPredictionErrors
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class TargetLock:
+class TargetLockState:
     """The target that the pipeline is locked onto: its last track and pose, the number of frames
     with an accepted pose (`accepted_frame_count`), and whether any of these poses used both markers
     (`has_shown_both_markers`). The track is in the world frame of the state estimate if
@@ -410,16 +415,16 @@ class TargetLock:
     `track_before_last_pose` is the track as it was before its last pose updated it; None after the
     first pose."""
 
-    track: MarkerTrack
-    pose: MarkerPose
+    track: MarkerFilterState
+    last_pose: MarkerPose
     is_in_world_frame: bool
     accepted_frame_count: int
     has_shown_both_markers: bool
-    track_before_last_pose: MarkerTrack | None = None
+    track_before_last_pose: MarkerFilterState | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class RivalTrack:
+class RivalTargetState:
     """A track of a target-like pattern at a position that contradicts the track of the locked
     target. It may be another target, or the target itself if its track is wrong.
 
@@ -431,40 +436,40 @@ class RivalTrack:
             number of frames that showed both of its markers.
         has_different_range_from_target: True if the rival's z, which is its range from a
             camera that looks straight up, differs significantly from the target's.
-        relative_position_text: the rival's position relative to the target, in words.
+        position_relative_to_target_text: the rival's position relative to the target, in words.
     """
 
-    track: MarkerTrack
+    track: MarkerFilterState
     is_in_world_frame: bool
     first_seen_at_s: float
     seen_frame_count: int
     frames_with_both_markers: int
     has_different_range_from_target: bool
-    relative_position_text: str
+    position_relative_to_target_text: str
 
 
 @dataclass(frozen=True, eq=False)
-class MarkerPoses:
+class FrameMarkerPoses:
     """The poses estimated from one frame.
 
     Attributes:
         poses_by_source: all poses, with the keys ``joint``, ``large`` and ``small`` in this order.
-        poses_by_track: the poses that update a track, by the track's name: ``joint``, or ``large``
-            and ``small``.
+        poses_by_updated_track: the poses that update a track, by the track's name: ``joint``, or
+            ``large`` and ``small``.
         do_markers_contradict: True if both markers were detected, but the positions computed from
             each of them differ by more than their errors explain.
     """
 
     poses_by_source: dict[str, MarkerPose] = field(default_factory=dict)
-    poses_by_track: dict[str, MarkerPose] = field(default_factory=dict)
+    poses_by_updated_track: dict[str, MarkerPose] = field(default_factory=dict)
     do_markers_contradict: bool = False
 
     @property
     def most_certain_pose(self) -> MarkerPose | None:
         """The pose whose position has the smallest standard deviation (norm of `sigma_m`), from
-        `poses_by_track` if it is not empty, otherwise from `poses_by_source`; None if there are no
-        poses."""
-        poses = self.poses_by_track or self.poses_by_source
+        `poses_by_updated_track` if it is not empty, otherwise from `poses_by_source`; None if there
+        are no poses."""
+        poses = self.poses_by_updated_track or self.poses_by_source
         return min(poses.values(), key=lambda p: float(p.sigma_m @ p.sigma_m), default=None)
 
 
@@ -479,7 +484,7 @@ class InterlacingState:
         top_field_first_vote_sum: sum of the votes on the order of the fields: positive if the top
             field seems to be first, negative if the bottom field does.
         is_top_field_first: order of the fields; None until the votes decide.
-        frame_periods_s: the most recent times between successive frames.
+        recent_frame_periods_s: the most recent times between successive frames.
         last_frame_t_s: time of the last frame.
         previous_image: the previous image, to which the next one is compared to find the order of
             the fields; None if it was not interlaced.
@@ -489,7 +494,7 @@ class InterlacingState:
     frames_since_combing_check: int = 0
     top_field_first_vote_sum: float = 0.0
     is_top_field_first: bool | None = None
-    frame_periods_s: tuple[float, ...] = ()
+    recent_frame_periods_s: tuple[float, ...] = ()
     last_frame_t_s: float | None = None
     previous_image: NDArray[np.uint8] | None = None
 
@@ -506,25 +511,25 @@ class PipelineState:
         target: estimate for the last frame in which there was a track; None before the first one.
         last_detections: detections of the last frame with an accepted marker; None if it is more
             than 1 s old.
-        last_pose: the last accepted pose; None if there is no track.
-        frames_with_contradicting_markers: number of successive accepted frames with both markers in
-            which the markers contradict each other.
-        frames_without_markers: number of successive frames without a marker.
+        last_accepted_pose: the last accepted pose; None if there is no track.
+        successive_frames_with_contradicting_markers: number of successive accepted frames with both
+            markers in which the markers contradict each other.
+        successive_frames_without_markers: number of successive frames without a marker.
         lock: the target that the pipeline is locked onto; None if there is none.
         rival: a similar pattern whose position contradicts the lock; None if there is none.
         interlacing_state: what is known about the interlacing of the images.
     """
 
-    tracks: dict[str, MarkerTrack] = field(default_factory=dict)
+    tracks: dict[str, MarkerFilterState] = field(default_factory=dict)
     are_tracks_in_world_frame: bool = False
-    marker_poses: MarkerPoses = MarkerPoses()
+    marker_poses: FrameMarkerPoses = FrameMarkerPoses()
     target: TargetEstimate | None = None
     last_detections: Detections | None = None
-    last_pose: LastPose | None = None
-    frames_with_contradicting_markers: int = 0
-    frames_without_markers: int = 0
-    lock: TargetLock | None = None
-    rival: RivalTrack | None = None
+    last_accepted_pose: LastAcceptedPose | None = None
+    successive_frames_with_contradicting_markers: int = 0
+    successive_frames_without_markers: int = 0
+    lock: TargetLockState | None = None
+    rival: RivalTargetState | None = None
     interlacing_state: InterlacingState = InterlacingState()
 
 
@@ -537,23 +542,23 @@ class PipelineOutput:
         poses: the target's poses by source: ``joint``, ``large`` or ``small``.
         target: the target estimate for the time of the frame; None if there is no track.
         stage: which markers were detected in this frame.
-        frames_with_contradicting_markers: number of successive accepted frames with both markers in
-            which the markers contradict each other.
+        successive_frames_with_contradicting_markers: number of successive accepted frames with both
+            markers in which the markers contradict each other.
         picture_kind: whether the image is a whole frame, interlaced (``woven``) or a field.
-        lock_note: why this frame's pose was rejected, or accepted at an unexpected position, or
-            that the frame shows several targets; otherwise empty.
-        is_foreign_target_seen: True if the pose was rejected because, judged by its position, it
-            shows another vehicle's target.
+        target_lock_message: why this frame's pose was rejected, or accepted at an unexpected
+            position, or that the frame shows several targets; otherwise empty.
+        is_other_vehicles_target_seen: True if the pose was rejected because, judged by its
+            position, it shows another vehicle's target.
     """
 
     detections: Detections
     poses: dict[str, MarkerPose]
     target: TargetEstimate | None
     stage: VisibleMarkers
-    frames_with_contradicting_markers: int = 0
+    successive_frames_with_contradicting_markers: int = 0
     picture_kind: PictureKind = "whole"
-    lock_note: str = ""
-    is_foreign_target_seen: bool = False
+    target_lock_message: str = ""
+    is_other_vehicles_target_seen: bool = False
 
 
 @dataclass(frozen=True)

@@ -112,7 +112,7 @@ def _fly(truth: Truth, rng: np.random.Generator, told_s: float) -> ConsistencySu
         rvec = cv2.Rodrigues(spoilt)[0].ravel()
         pose = MarkerPose(
             "joint", exposed_s, rvec, way, np.zeros(3), 0.0, np.full(3, POSE_M), POSE_RAD, 0.1,
-            xyz_yaw_cov=cov,
+            level_frame_xyz_yaw_cov=cov,
         )  # fmt: skip
         t_s = exposed_s + late_s
         before, after = (

@@ -35,7 +35,7 @@ SETUP = PoseSetup(
 START_S = CameraConfig(latency_s="measured").start_latency_s
 POSE = MarkerPose(
     "joint", 0.0, np.array([math.pi, 0.0, 0.0]), np.array([0.0, 0.0, 1.2]), np.zeros(3), 0.0,
-    np.full(3, 1e-3), 1e-3, 0.1, xyz_yaw_cov=np.diag([1e-6] * 4),
+    np.full(3, 1e-3), 1e-3, 0.1, level_frame_xyz_yaw_cov=np.diag([1e-6] * 4),
 )  # fmt: skip
 
 
@@ -113,7 +113,7 @@ def test_another_latency_is_taken_over_within_half_a_second(
 def test_what_is_no_number_teaches_nothing() -> None:
     """A covariance that broke down."""
     history = History(tuple(telemetry(10.0 + 0.01 * k) for k in range(-40, 40)))
-    broken = replace(POSE, xyz_yaw_cov=np.full((4, 4), math.nan))
+    broken = replace(POSE, level_frame_xyz_yaw_cov=np.full((4, 4), math.nan))
     start = OnlineCalibration()
     learned = update_calibration(start, 10.0, broken, history, SETUP, 0.005)
     assert learned.newest is None

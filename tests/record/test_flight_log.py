@@ -97,7 +97,7 @@ def test_every_field_is_filled_by_something() -> None:
     pose = synthetic.target(1.0, 1.6)
     frame = synthetic.output(3, pose, np.random.default_rng(1))
     frame.poses["joint"] = frame.poses["large"]
-    frame = replace(frame, lock_note="not the tracked target")
+    frame = replace(frame, target_lock_message="not the tracked target")
     battery = BatteryOutlook(60.0, 3, 12.5, 3.9)
     state = state_with(
         phase=Phase.ALIGN, reason="steady", hold_reason="no picture", battery=battery

@@ -186,13 +186,15 @@ def test_sides_along_the_rows_of_a_field_claim_what_interpolation_does_to_them(
         image = render(*T, noise=2.0, seed=k)
         field = Frame(0, 0.0, interpolate_field(image, first_row), picture_kind=kind)
         seen = detect_markers(field, None, setup.detector_setup, CAMERA).large
-        assert seen.horizontal_side_extra_sigma_px > 0.0
+        assert seen.horizontal_side_deinterlacing_sigma_px > 0.0
         for name, d in (
             ("claimed", seen),
-            ("as elsewhere", replace(seen, horizontal_side_extra_sigma_px=0.0)),
+            ("as elsewhere", replace(seen, horizontal_side_deinterlacing_sigma_px=0.0)),
         ):
             pose = estimate_pose([d], 0.0, None, setup.pose_setup)
             e = pose.tvec_m - T[1]
-            squares[name].append(float(e @ np.linalg.solve(pose.xyz_yaw_cov[:3, :3], e)) / 3.0)
+            squares[name].append(
+                float(e @ np.linalg.solve(pose.level_frame_xyz_yaw_cov[:3, :3], e)) / 3.0
+            )
     assert 0.2 < np.mean(squares["claimed"]) < 2.0
     assert np.mean(squares["as elsewhere"]) > 3.0

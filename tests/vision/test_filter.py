@@ -17,36 +17,39 @@ from perchctl.geometry import Array, make_T, rot_z, rotation_from_rpy, wrap_rad
 from perchctl.profile import KalmanConfig, TargetConfig
 from perchctl.vision import MarkerPose, Pipeline, PipelineState, VehicleState
 from perchctl.vision.filter import (
-    MEASURED_ELEMENTS,
-    POSITION,
-    RATE_ELEMENTS,
-    TILT_BIAS_COLUMNS,
-    VELOCITY,
-    VX,
-    YAW,
-    YAW_RATE,
+    MEASURED_STATE_ELEMENTS,
+    POSITION_STATE_ELEMENTS,
+    RATE_STATE_ELEMENTS,
+    ROLL_PITCH_BIAS_COLUMNS,
+    VELOCITY_STATE_ELEMENTS,
+    VX_STATE_INDEX,
+    X_STATE_INDEX,
+    Y_STATE_INDEX,
+    YAW_RATE_STATE_INDEX,
+    YAW_STATE_INDEX,
+    Z_STATE_INDEX,
     TrackMeasurement,
-    X,
-    Y,
-    Z,
     make_filter_setup,
     start_track,
     step_track,
 )
 from perchctl.vision.pipeline import step_from_detections
 from perchctl.vision.target_selection import make_track_measurement
-from perchctl.vision.types import MarkerTrack
+from perchctl.vision.types import MarkerFilterState
 from tests.helpers.seen import seen_from
 
 CONFIG = KalmanConfig(noise="fixed")
 SETUP = make_filter_setup(CONFIG)
-H = np.eye(8)[MEASURED_ELEMENTS]
+H = np.eye(8)[MEASURED_STATE_ELEMENTS]
 
 
 def test_gains_are_the_papers_units_in_si() -> None:
     setup = make_filter_setup(KalmanConfig(k1=0.09, k2=0.01, noise="fixed"))
     assert np.allclose(np.sqrt(np.diag(setup.R)), [math.radians(0.3), 0.003, 0.003, 0.003])
-    assert np.allclose(np.sqrt(np.diag(setup.Q))[[X, VX, YAW]], [0.001, 0.001, math.radians(0.1)])
+    assert np.allclose(
+        np.sqrt(np.diag(setup.Q))[[X_STATE_INDEX, VX_STATE_INDEX, YAW_STATE_INDEX]],
+        [0.001, 0.001, math.radians(0.1)],
+    )
     assert np.count_nonzero(setup.R - np.diag(np.diag(setup.R))) == 0
     assert np.count_nonzero(setup.Q - np.diag(np.diag(setup.Q))) == 0
 
@@ -67,7 +70,7 @@ steps = st.lists(
 def test_equals_a_filter_written_out_by_hand(steps, k1: float, k2: float) -> None:
     setup = make_filter_setup(KalmanConfig(k1=k1, k2=k2, n_max=100, alpha=0.85, noise="fixed"))
     z0 = np.array([0.1, 0.2, -0.1, 0.5])
-    track: MarkerTrack | None = start_track(TrackMeasurement(z0), 0.0, setup)
+    track: MarkerFilterState | None = start_track(TrackMeasurement(z0), 0.0, setup)
     x, P, t = np.zeros(8), setup.P0.copy(), 0.0
     x[[0, 2, 4, 6]] = z0
     for dt, was_seen, z in steps:
@@ -87,7 +90,7 @@ def test_equals_a_filter_written_out_by_hand(steps, k1: float, k2: float) -> Non
             x = x + K @ innovation
             P = (np.eye(8) - K @ H) @ P
         difference = track.x - x
-        difference[YAW] = wrap_rad(float(difference[YAW]))
+        difference[YAW_STATE_INDEX] = wrap_rad(float(difference[YAW_STATE_INDEX]))
         assert np.abs(difference).max() < 1e-7
         assert np.abs(track.P - P).max() < 1e-9
 
@@ -99,20 +102,22 @@ def test_yaw_follows_across_the_wrap(start: float, rate: float) -> None:
     for k in range(40):
         yaw = wrap_rad(start + rate * k / 30)
         track = step_track(track, TrackMeasurement(np.array([yaw, 0.0, 0.0, 0.5])), k / 30, SETUP)
-    assert -math.pi < track.x[YAW] <= math.pi
-    assert abs(wrap_rad(float(track.x[YAW]) - yaw)) < 0.15
-    assert track.x[YAW_RATE] == pytest.approx(rate, abs=0.4)
+    assert -math.pi < track.x[YAW_STATE_INDEX] <= math.pi
+    assert abs(wrap_rad(float(track.x[YAW_STATE_INDEX]) - yaw)) < 0.15
+    assert track.x[YAW_RATE_STATE_INDEX] == pytest.approx(rate, abs=0.4)
 
 
 def test_velocities_decay_and_the_track_is_dropped_after_n_max() -> None:
-    track: MarkerTrack | None = MarkerTrack(0.0, np.arange(8) / 10.0, np.eye(8) * 1e-4, 0)
-    rates, position = track.x[RATE_ELEMENTS].copy(), track.x[POSITION].copy()
+    track: MarkerFilterState | None = MarkerFilterState(
+        0.0, np.arange(8) / 10.0, np.eye(8) * 1e-4, 0
+    )
+    rates, position = track.x[RATE_STATE_ELEMENTS].copy(), track.x[POSITION_STATE_ELEMENTS].copy()
     for n in range(1, CONFIG.n_max + 1):
         track = step_track(track, None, n / 30, SETUP)
         assert track.unseen_frames == n
-        assert np.allclose(track.x[RATE_ELEMENTS], rates * CONFIG.alpha**n)
-        position = position + track.x[VELOCITY] / 30
-        assert np.allclose(track.x[POSITION], position)
+        assert np.allclose(track.x[RATE_STATE_ELEMENTS], rates * CONFIG.alpha**n)
+        position = position + track.x[VELOCITY_STATE_ELEMENTS] / 30
+        assert np.allclose(track.x[POSITION_STATE_ELEMENTS], position)
     assert step_track(track, None, (CONFIG.n_max + 1) / 30, SETUP) is None
     again = step_track(
         track, TrackMeasurement(np.array([0.0, 1.0, 2.0, 3.0])), (CONFIG.n_max + 1) / 30, SETUP
@@ -140,7 +145,7 @@ def test_a_frame_that_is_not_newer_changes_nothing(t_s: float) -> None:
 def test_a_long_gap_starts_afresh(t_s: float) -> None:
     start = start_track(TrackMeasurement(np.array([0.1, 0.2, 0.3, 0.4])), 0.0, SETUP)
     track = step_track(start, TrackMeasurement(np.ones(4)), t_s, SETUP)
-    assert np.allclose(track.x[[YAW, X, Y, Z]], 1.0)
+    assert np.allclose(track.x[[YAW_STATE_INDEX, X_STATE_INDEX, Y_STATE_INDEX, Z_STATE_INDEX]], 1.0)
     assert np.array_equal(track.P, SETUP.P0)
     assert step_track(start, None, t_s, SETUP) is None
 
@@ -157,23 +162,23 @@ def test_a_jump_beyond_the_motion_model_teaches_a_camera_no_speed(
     setup, R = make_filter_setup(KalmanConfig()), np.diag([1e-3, 1e-3, 1e-3, 1e-3]) ** 2
     place, jump = np.array([0.1, 0.2, -0.1, 0.6]), np.array([0.0, *jump_m])
     steps = np.array([0.0, *velocity_mps]) / 30.0
-    track: MarkerTrack | None = None
+    track: MarkerFilterState | None = None
     for k in range(20):
         track = step_track(track, TrackMeasurement(place + k * steps, R), k / 30.0, setup)
     jumped = place + 20 * steps + jump
     track = step_track(track, TrackMeasurement(jumped, R), 20 / 30.0, setup)
-    assert np.allclose(track.x[MEASURED_ELEMENTS], jumped)
-    assert np.abs(track.x[RATE_ELEMENTS]).max() == 0.0
-    sigma_m = np.sqrt(track.P.diagonal()[POSITION])
+    assert np.allclose(track.x[MEASURED_STATE_ELEMENTS], jumped)
+    assert np.abs(track.x[RATE_STATE_ELEMENTS]).max() == 0.0
+    sigma_m = np.sqrt(track.P.diagonal()[POSITION_STATE_ELEMENTS])
     assert (sigma_m > 0.9 * np.abs(jump_m) - 0.01).all()
     confirmed = step_track(track, TrackMeasurement(jumped + steps, R), 21 / 30.0, setup)
-    assert np.sqrt(confirmed.P.diagonal()[POSITION]).max() < 0.002
+    assert np.sqrt(confirmed.P.diagonal()[POSITION_STATE_ELEMENTS]).max() < 0.002
     # In the world of a state estimate a camera's motion is known.
     world, there = make_filter_setup(KalmanConfig(), is_world_frame=True), None
     for k in range(20):
         there = step_track(there, TrackMeasurement(place, R), k / 30.0, world)
     there = step_track(there, TrackMeasurement(place + jump, R), 20 / 30.0, world)
-    assert not np.allclose(there.x[MEASURED_ELEMENTS], place + jump)
+    assert not np.allclose(there.x[MEASURED_STATE_ELEMENTS], place + jump)
 
 
 # --- What the filter claims is what it errs by, and it errs no more than each frame alone ------
@@ -278,10 +283,10 @@ def test_the_consider_term_is_what_a_wrong_attitude_does(
         level = rotation_from_rpy(attitude.roll_rad, attitude.pitch_rad, 0.0) @ in_body
         pose = MarkerPose(
             "joint", 0.0, np.zeros(3), np.zeros(3), level, 0.2, np.ones(3), 1.0, 0.0,
-            xyz_yaw_cov=1e-6 * np.eye(4),
+            level_frame_xyz_yaw_cov=1e-6 * np.eye(4),
         )  # fmt: skip
         found = make_track_measurement(pose, attitude, in_world, constants, setup.pose_setup)
-        return found.z, found.yaw_xyz_shift_per_bias_sigma[:, TILT_BIAS_COLUMNS]
+        return found.z, found.yaw_xyz_shift_per_bias_sigma[:, ROLL_PITCH_BIAS_COLUMNS]
 
     (z, tilt), (moved, _) = measured(true), measured(wrong)
     expected = tilt @ np.array(bias_rad) / math.radians(0.3)

@@ -22,18 +22,18 @@ from perchctl.vision import (
     VehicleState,
     estimate,
 )
-from perchctl.vision.filter import TrackMeasurement, X, make_filter_setup
+from perchctl.vision.filter import X_STATE_INDEX, TrackMeasurement, make_filter_setup
 from perchctl.vision.pipeline import step_from_detections
 from perchctl.vision.tracks import (
-    LOCK_TIMEOUT_S,
-    MIN_ESTABLISHED_LOCK_FRAMES,
-    MIN_RIVAL_ALONE_IN_VIEW_DURATION_S,
-    MIN_RIVAL_DURATION_TO_LOCK_S,
+    MIN_FRAMES_TO_ESTABLISH_TARGET_LOCK,
+    MIN_RIVAL_ALONE_TIME_TO_LOCK_WITHOUT_ATTITUDE_S,
+    MIN_TARGET_UNSEEN_TIME_TO_LOCK_RIVAL_S,
+    UNSEEN_TARGET_LOCK_TIMEOUT_S,
     FramePose,
     _is_pose_clearly_consistent,
     judge_pose,
 )
-from perchctl.vision.types import Detections, MarkerTrack, RivalTrack, TargetLock
+from perchctl.vision.types import Detections, MarkerFilterState, RivalTargetState, TargetLockState
 from tests.helpers.seen import seen_from
 
 Build = Callable[..., Pipeline]
@@ -129,10 +129,12 @@ def test_what_contradicts_the_lock_is_not_measured(watch: Watch, name: str) -> N
     assert all(measured(watch.show(LOCKED)))
     decoy = DECOYS[name]
     lasts = watch.in_world or "markers" in decoy
-    outputs = watch.show(72 if lasts else int(MIN_RIVAL_ALONE_IN_VIEW_DURATION_S * HZ), **decoy)
+    outputs = watch.show(
+        72 if lasts else int(MIN_RIVAL_ALONE_TIME_TO_LOCK_WITHOUT_ATTITUDE_S * HZ), **decoy
+    )
     assert all(output.poses for output in outputs)  # it was seen
     assert not any(measured(outputs))
-    assert all(o.lock_note.startswith("not the tracked target: ") for o in outputs)
+    assert all(o.target_lock_message.startswith("not the tracked target: ") for o in outputs)
     told = [o.target for o in outputs if o.target is not None]
     assert len(told) == watch.setup.kalman.n_max
     assert all(abs(t.e_m[2] - RANGE_M) < 0.03 for t in told)
@@ -141,7 +143,7 @@ def test_what_contradicts_the_lock_is_not_measured(watch: Watch, name: str) -> N
         assert output.target is None or covers(output.target, seen)
     (back,) = watch.show(1)
     assert measured([back]) == [True]
-    assert back.lock_note == ""
+    assert back.target_lock_message == ""
 
 
 @settings(max_examples=80)
@@ -155,7 +157,7 @@ def test_what_is_clearly_the_targets_is_so_by_every_spread(
     off_m: tuple[float, float, float], off_rad: float, sigma_m: float, range_m: float
 ) -> None:
     """By way of all spreads, as beside a rival, too."""
-    track = MarkerTrack(t_s=0.0, x=np.zeros(8), P=np.eye(8) * sigma_m**2)
+    track = MarkerFilterState(t_s=0.0, x=np.zeros(8), P=np.eye(8) * sigma_m**2)
     pose = MarkerPose(
         "joint", 0.03, np.zeros(3), np.array([0.0, 0.0, range_m]), np.zeros(3), 0.0, np.ones(3),
         1.0, 0.0,
@@ -165,10 +167,10 @@ def test_what_is_clearly_the_targets_is_so_by_every_spread(
         0.03, pose, TrackMeasurement(z, np.eye(4) * sigma_m**2, np.eye(4) * 0.01), True, True
     )
     constants = make_filter_setup(KalmanConfig(), is_world_frame=True)
-    rival = RivalTrack(replace(track, x=np.full(8, 5.0)), True, 0.0, 1, 1, False, "")
-    lock = TargetLock(
+    rival = RivalTargetState(replace(track, x=np.full(8, 5.0)), True, 0.0, 1, 1, False, "")
+    lock = TargetLockState(
         track=track,
-        pose=pose,
+        last_pose=pose,
         is_in_world_frame=True,
         accepted_frame_count=9,
         has_shown_both_markers=True,
@@ -182,18 +184,20 @@ def test_a_pose_that_fits_the_track_before_the_last_one_is_the_targets(
     x_m: float, in_world: bool
 ) -> None:
     """If the last pose has led the track 1 m away. In flight no single pose does."""
-    before = MarkerTrack(t_s=-0.1, x=np.zeros(8), P=np.eye(8) * 1e-4)
-    track = MarkerTrack(t_s=0.0, x=np.eye(8)[X], P=np.eye(8) * 1e-4)
+    before = MarkerFilterState(t_s=-0.1, x=np.zeros(8), P=np.eye(8) * 1e-4)
+    track = MarkerFilterState(t_s=0.0, x=np.eye(8)[X_STATE_INDEX], P=np.eye(8) * 1e-4)
     pose = MarkerPose(
         "joint", 0.1, np.zeros(3), np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.0, np.ones(3), 1.0, 0.0
     )
     measured = TrackMeasurement(np.array([0.0, x_m, 0.0, 0.0]), np.eye(4) * 1e-4)
     sight = FramePose(0.1, pose, measured, in_world, True)
-    lock = TargetLock(track, replace(pose, e_m=np.full(3, 5.0)), in_world, 9, True, before)
+    lock = TargetLockState(track, replace(pose, e_m=np.full(3, 5.0)), in_world, 9, True, before)
     verdict = judge_pose(lock, None, sight, make_filter_setup(KalmanConfig(), in_world))
     assert verdict.is_accepted is (x_m == -0.02 and not in_world)
     assert verdict.keeps_lock_at_restart is verdict.is_accepted
-    again = TargetLock(track, lock.pose, in_world, 9, True)  # as long as nothing is known of before
+    again = TargetLockState(
+        track, lock.last_pose, in_world, 9, True
+    )  # as long as nothing is known of before
     assert not judge_pose(
         again, None, sight, make_filter_setup(KalmanConfig(), in_world)
     ).is_accepted
@@ -207,12 +211,16 @@ def test_without_the_gate_all_of_them_steer(build: Build) -> None:
 
 def test_a_target_that_moved_is_taken_up_anew_after_a_while(watch: Watch) -> None:
     watch.show(LOCKED)
-    while_s = MIN_RIVAL_DURATION_TO_LOCK_S if watch.in_world else MIN_RIVAL_ALONE_IN_VIEW_DURATION_S
+    while_s = (
+        MIN_TARGET_UNSEEN_TIME_TO_LOCK_RIVAL_S
+        if watch.in_world
+        else MIN_RIVAL_ALONE_TIME_TO_LOCK_WITHOUT_ATTITUDE_S
+    )
     outputs = watch.show(int(1.2 * while_s * HZ) + 2, away_m=(0.3, 0.0, 0.0))
     first = measured(outputs).index(True)
     assert while_s * HZ - 1 <= first <= while_s * HZ + 2
     assert all(measured(outputs[first:]))
-    assert outputs[first].lock_note.startswith("target reacquired 0.3")
+    assert outputs[first].target_lock_message.startswith("target reacquired 0.3")
     target = outputs[first].target
     assert np.linalg.norm(target.e_m[:2]) > 0.2
 
@@ -232,13 +240,15 @@ def test_a_second_target_seen_beside_the_first_takes_no_camera_alone_soon(build:
     for _ in range(3):
         assert not any(measured(watch.show(2, away_m=(0.3, 0.0, 0.0))))
         assert all(measured(watch.show(2)))
-    outputs = watch.show(int(1.2 * MIN_RIVAL_DURATION_TO_LOCK_S * HZ), away_m=(0.3, 0.0, 0.0))
-    assert measured(outputs).index(True) >= MIN_RIVAL_DURATION_TO_LOCK_S * HZ - 2
+    outputs = watch.show(
+        int(1.2 * MIN_TARGET_UNSEEN_TIME_TO_LOCK_RIVAL_S * HZ), away_m=(0.3, 0.0, 0.0)
+    )
+    assert measured(outputs).index(True) >= MIN_TARGET_UNSEEN_TIME_TO_LOCK_RIVAL_S * HZ - 2
 
 
 def test_no_jump_locks_the_pipeline_out_for_ever(watch: Watch) -> None:
     watch.show(LOCKED)
-    assert not any(measured(watch.show(int((LOCK_TIMEOUT_S - 0.1) * HZ), **HALF)))
+    assert not any(measured(watch.show(int((UNSEEN_TARGET_LOCK_TIMEOUT_S - 0.1) * HZ), **HALF)))
     assert any(measured(watch.show(int(0.5 * HZ), **HALF)))
 
 
@@ -279,7 +289,7 @@ def test_an_estimate_that_jumps_while_frames_are_missed_loses_no_target(
     outputs = watch.show(10)
     assert all(measured(outputs))
     if jump_m in LARGE_JUMPS_M:
-        assert outputs[0].lock_note == "the state estimate jumped, but the target did not"
+        assert outputs[0].target_lock_message == "the state estimate jumped, but the target did not"
         for output in outputs:
             assert np.abs(output.target.world_m - TARGET_M - jump_m).max() < 0.015
 
@@ -321,8 +331,8 @@ def test_a_clock_that_was_set_back_begins_anew(watch: Watch) -> None:
 def test_both_markers_overrule_a_lock_on_one(watch: Watch) -> None:
     """What was locked on was perhaps never the target."""
     watch.show(20, markers=("large",), scale=0.5)
-    outputs = watch.show(MIN_ESTABLISHED_LOCK_FRAMES + 1)
-    assert measured(outputs) == [False] * (MIN_ESTABLISHED_LOCK_FRAMES - 1) + [True] * 2
+    outputs = watch.show(MIN_FRAMES_TO_ESTABLISH_TARGET_LOCK + 1)
+    assert measured(outputs) == [False] * (MIN_FRAMES_TO_ESTABLISH_TARGET_LOCK - 1) + [True] * 2
 
 
 def test_a_lock_of_a_moment_gives_way_to_what_lasts(watch: Watch) -> None:
@@ -334,7 +344,9 @@ def test_a_lock_of_a_moment_gives_way_to_what_lasts(watch: Watch) -> None:
 def test_a_lone_marker_never_moves_an_established_lock(watch: Watch) -> None:
     watch.show(LOCKED)
     outputs = watch.show(
-        int(2.0 * MIN_RIVAL_DURATION_TO_LOCK_S * HZ), markers=("large",), away_m=(0.3, 0.0, 0.0)
+        int(2.0 * MIN_TARGET_UNSEEN_TIME_TO_LOCK_RIVAL_S * HZ),
+        markers=("large",),
+        away_m=(0.3, 0.0, 0.0),
     )
     assert not any(measured(outputs))
 
@@ -356,4 +368,4 @@ def test_of_two_targets_in_view_one_is_told(build: Build) -> None:
     T = make_T(rot_z(0.0), TARGET_M - [0.0, 0.0, RANGE_M])
     seen = seen_from(T, TARGET_M, watch.k / HZ, watch.rng)
     _, output = step_from_detections(watch.state, replace(seen, target_count=2), None, watch.setup)
-    assert "more than one target in view" in output.lock_note
+    assert "more than one target in view" in output.target_lock_message

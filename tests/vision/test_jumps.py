@@ -15,7 +15,7 @@ from perchctl.geometry import Array, make_T, rot_z, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.vision import MARKERS, Pipeline, PipelineState, VehicleState
 from perchctl.vision.pipeline import step_from_detections
-from perchctl.vision.tracks import MIN_RIVAL_ALONE_IN_VIEW_DURATION_S
+from perchctl.vision.tracks import MIN_RIVAL_ALONE_TIME_TO_LOCK_WITHOUT_ATTITUDE_S
 from tests.helpers.seen import seen_from
 
 Build = Callable[..., Pipeline]
@@ -180,7 +180,9 @@ def test_no_vaguer_track_excuses_a_jump(build: Build, hz: float, away_m: float) 
     jump_m = away_m * np.array([0.5, 0.866, 0.0])
     told = claims(build(), Scene("target", jump_m, hz, 1.0, 0.4, ("large",), 0.1), in_flight=False)
     assert not any(
-        claim.measured for claim in told if claim.after_s < MIN_RIVAL_ALONE_IN_VIEW_DURATION_S
+        claim.measured
+        for claim in told
+        if claim.after_s < MIN_RIVAL_ALONE_TIME_TO_LOCK_WITHOUT_ATTITUDE_S
     )
 
 
@@ -200,7 +202,8 @@ def test_an_estimate_that_jumps_leaves_the_target_where_the_picture_has_it(
 def test_a_target_that_moves_in_flight_is_nowhere_with_confidence(
     build: Build, scene: Scene
 ) -> None:
-    """Whether it moved or another one is seen takes `MIN_RIVAL_DURATION_TO_LOCK_S` to decide."""
+    """Whether it moved or another one is seen takes `MIN_TARGET_UNSEEN_TIME_TO_LOCK_RIVAL_S` to
+    decide."""
     told = claims(build(), scene, in_flight=True)
     assume(told)
     assert longest_false_s(told, scene.hz) <= 0.1
@@ -240,7 +243,7 @@ def test_the_spread_after_lost_frames_is_true(
             again = [
                 claim
                 for claim in told
-                if claim.after_s > MIN_RIVAL_ALONE_IN_VIEW_DURATION_S + 2.0 / hz
+                if claim.after_s > MIN_RIVAL_ALONE_TIME_TO_LOCK_WITHOUT_ATTITUDE_S + 2.0 / hz
             ]
             squared += [((c.off_m / c.sigma_m) ** 2).mean() for c in again if c.measured]
     assert len(squared) > 100

@@ -91,7 +91,7 @@ def measured(scene: Pass, readout_s: float | None) -> tuple[Array, float]:
             error = np.array(
                 [*(pose.tvec_m - scene.target_m(part.t_s)), pose.e_yaw_rad - yaw_of(R)]
             )
-            nees.append(error @ np.linalg.solve(pose.xyz_yaw_cov, error) / 4.0)
+            nees.append(error @ np.linalg.solve(pose.level_frame_xyz_yaw_cov, error) / 4.0)
             errors.append([*(1000.0 * error[:3]), np.degrees(error[3])])
     return np.sqrt(np.mean(np.square(errors), axis=0)), float(np.mean(nees))
 

@@ -43,7 +43,7 @@ from perchctl.vision import (
     step,
 )
 from perchctl.vision.tracks import predict_corners, update_last_pose
-from perchctl.vision.types import LastPose, VisibleMarkers
+from perchctl.vision.types import LastAcceptedPose, VisibleMarkers
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
 Build = Callable[..., Pipeline]
@@ -192,7 +192,7 @@ def test_markers_that_contradict_are_counted_and_the_better_is_used(
     for k in range(3):
         image = render(*pose_of(0.0, 0.0, 0.24))
         state, output = step(state, Frame(k, k / 30, image), None, setup)
-        assert output.frames_with_contradicting_markers == k + 1
+        assert output.successive_frames_with_contradicting_markers == k + 1
         assert output.target.e_m[2] == pytest.approx(0.24, abs=0.001)
         assert output.target.stage is VisibleMarkers.LARGE
 
@@ -251,14 +251,14 @@ def test_a_stream_without_the_target_is_looked_at_thoroughly_every_nth_frame(bui
         state, output = step(state, Frame(k, k / 30, EMPTY if k == 0 else hidden), None, setup)
         found.append(output.detections.large is not None)
     assert found == [False, False, False, False, True]
-    assert state.frames_without_markers == 0
+    assert state.successive_frames_without_markers == 0
 
 
 def test_the_vehicles_motion_predicts_the_corners(build: Build) -> None:
     setup = build(mount=MOUNT, gear_body_m=GEAR)
     then, now = fly(0), fly(6)  # far, and turned, within one gap
     _, output = step(PipelineState(), Frame(0, then.t_s, view(then)), then, setup)
-    sight = LastPose(output.poses["joint"], then)
+    sight = LastAcceptedPose(output.poses["joint"], then)
     expected, near = predict_corners(sight, now.t_s, now, setup.pose_setup)
     _, later = step(PipelineState(), Frame(1, now.t_s, view(now)), now, setup)
     for name in ("large", "small"):
@@ -313,7 +313,7 @@ class Flight:
 
 def errors_px(flight: Flight, frames: int, *, told: bool = True) -> Iterator[float]:
     """By how much the large marker's corners are expected in the wrong place, by frame."""
-    sight: LastPose | None = None
+    sight: LastAcceptedPose | None = None
     for k in range(frames):
         attitude, pose = flight.at(k * FRAME_S)
         if not told:

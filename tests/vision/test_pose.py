@@ -36,7 +36,7 @@ from perchctl.vision import (
     square_corners,
     step,
 )
-from perchctl.vision.filter import PRINT_BIAS_COLUMNS, make_filter_setup
+from perchctl.vision.filter import PRINT_SIZE_CURL_BIAS_COLUMNS, make_filter_setup
 from perchctl.vision.merge import are_marker_positions_inconsistent
 from perchctl.vision.pose import target_normal_cam
 from perchctl.vision.target_selection import make_track_measurement
@@ -202,7 +202,7 @@ def test_the_covariance_is_that_of_the_errors(seen: list[str]) -> None:
         pose = posed(detections, attitude)
         true = rotation_from_rpy(attitude.roll_rad, attitude.pitch_rad, 0.0) @ tvec
         error = np.append(pose.e_m - true, wrap_rad(pose.e_yaw_rad - values[3]))
-        squares.append(error @ np.linalg.solve(pose.xyz_yaw_cov, error))
+        squares.append(error @ np.linalg.solve(pose.level_frame_xyz_yaw_cov, error))
     assert 0.8 < np.mean(squares) / 4.0 < 1.2
 
 
@@ -310,7 +310,7 @@ def test_a_wrong_size_is_within_its_claim(scale: float, most: float) -> None:
         pose = solved(["large", "small"], setup, place, scale, rng=rng)
         true = solved(["large", "small"], setup, place)
         off = np.append(pose.e_m - true.e_m, wrap_rad(pose.e_yaw_rad - true.e_yaw_rad))
-        squares.append(float(off @ np.linalg.solve(pose.xyz_yaw_cov, off)))
+        squares.append(float(off @ np.linalg.solve(pose.level_frame_xyz_yaw_cov, off)))
     assert np.mean(squares) < most + 4.0
 
 
@@ -336,7 +336,10 @@ def test_the_print_s_errors_are_no_noise_of_a_measurement() -> None:
     assert known.R is not None
     assert told.R is not None
     assert np.allclose(known.R, told.R, rtol=1e-6, atol=1e-15)
-    assert np.linalg.norm(told.yaw_xyz_shift_per_bias_sigma[1:, PRINT_BIAS_COLUMNS]) > 0.02 * 0.3
+    assert (
+        np.linalg.norm(told.yaw_xyz_shift_per_bias_sigma[1:, PRINT_SIZE_CURL_BIAS_COLUMNS])
+        > 0.02 * 0.3
+    )
 
 
 # --- The spread that a picture's pose claims is what it errs by --------------------------------
@@ -364,7 +367,7 @@ def squared(
         pose: MarkerPose = next(poses[n] for n in ("joint", "large", "small") if n in poses)
         turned = seen_heading(rvec)
         off = np.append(pose.e_m - tvec, wrap_rad(pose.e_yaw_rad - turned))
-        found.append(float(off @ np.linalg.solve(pose.xyz_yaw_cov, off)) / 4.0)
+        found.append(float(off @ np.linalg.solve(pose.level_frame_xyz_yaw_cov, off)) / 4.0)
     return float(np.mean(found))
 
 

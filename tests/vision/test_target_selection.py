@@ -25,7 +25,10 @@ from perchctl.vision import (
     make_pipeline,
     step,
 )
-from perchctl.vision.target_selection import OwnTargetPosition, marker_to_own_target_distance_m
+from perchctl.vision.target_selection import (
+    ExpectedOwnTargetPosition,
+    marker_to_own_target_distance_m,
+)
 from tests.helpers.markers import box
 
 K = np.array([[380.0, 0.0, 319.5], [0.0, 380.0, 239.5], [0.0, 0.0, 1.0]])
@@ -150,11 +153,11 @@ def test_another_s_is_refused_with_the_reason_until_the_own_comes_into_view() ->
         output = flown.at(beyond_m, BOTH_READ_M)
         assert output.detections.large is not None
         assert output.target is None
-        assert output.is_foreign_target_seen
-        assert "0.50 m from target.expected_xy_m is ignored" in output.lock_note
+        assert output.is_other_vehicles_target_seen
+        assert "0.50 m from target.expected_xy_m is ignored" in output.target_lock_message
     outputs = list(flown.along(beyond_m, between_both(0.5), BOTH_READ_M, 20))
     assert place(outputs[-1]) == pytest.approx(OWN_M, abs=0.02)
-    assert not outputs[-1].is_foreign_target_seen
+    assert not outputs[-1].is_other_vehicles_target_seen
     places = [p for p in map(place, outputs) if p is not None]
     assert all(p == pytest.approx(OWN_M, abs=0.02) for p in places)
 
@@ -185,11 +188,11 @@ def test_a_lock_goes_over_only_where_its_own_place_is_looked_at_and_empty(
     for _ in flown.along(OWN_M, away_m, BOTH_READ_M, 12):
         pass
     flown.neighbour = ALONE if taken else ALIKE
-    notes = [flown.at(away_m, BOTH_READ_M).lock_note for _ in range(42)]
+    notes = [flown.at(away_m, BOTH_READ_M).target_lock_message for _ in range(42)]
     assert any("reacquired" in note for note in notes) is taken
     assert any(note.startswith("not the tracked target") for note in notes)
     if not taken:  # an estimate that jumped would have it elsewhere: not for ever
-        later = [flown.at(away_m, BOTH_READ_M).lock_note for _ in range(30)]
+        later = [flown.at(away_m, BOTH_READ_M).target_lock_message for _ in range(30)]
         assert any("reacquired" in note for note in later)
 
 
@@ -198,7 +201,7 @@ def test_a_marker_without_a_pose_yet_is_refused_only_by_a_known_place() -> None:
     spoilt, setup = box(320, 240, 120), make_pipeline(profile(), CAMERA).pose_setup
     spoilt[0] += 60.0, 0.0
     level = VehicleState(0.0, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0))
-    anywhere, known = OwnTargetPosition(), OwnTargetPosition((0.0, 0.0), 0.3)
+    anywhere, known = ExpectedOwnTargetPosition(), ExpectedOwnTargetPosition((0.0, 0.0), 0.3)
     for place, attitude in ((anywhere, None), (known, None), (anywhere, level)):
         offset_m = marker_to_own_target_distance_m(place, 0.0, attitude, setup, "large", spoilt)
         assert 1e3 < offset_m < math.inf  # behind all that have a pose

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.vision.lens import distort_to_px, undistort_to_normalised
-from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
+from perchctl.vision.types import CameraModel, EdgeShiftEstimate, MarkerName
 
 CENTRED_SQUARE: Array = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 """Corners of the centred square, -1 to 1, in the marker's own coordinates, (4, 2)."""
@@ -174,10 +174,10 @@ class RefinedCorners:
             whole growth if it was not corrected.
         blurriest_side_blur_sigma_px, sharpest_side_blur_sigma_px: standard deviations of the
             Gaussian blur, px, of the marker's blurriest side and of its sharpest side.
-        removed_edge_shift: an `EdgeShift`, for which the corners are corrected: the distance in
-            pixels by which white has grown over black at all edges of the image (blooming, gamma),
-            and its standard deviation. It was measured in this frame or in an earlier one. None if
-            the growth is unknown; the corners are then not corrected.
+        removed_edge_shift: an `EdgeShiftEstimate`, for which the corners are corrected: the
+            distance in pixels by which white has grown over black at all edges of the image
+            (blooming, gamma), and its standard deviation. It was measured in this frame or in an
+            earlier one. None if the growth is unknown; the corners are then not corrected.
         cov_px2: covariance (8, 8), px^2 in the image of a pinhole camera, in the order x0, y0, x1,
             y1, ..., of corners that were inferred from a visible part of the marker; None for
             corners from other methods.
@@ -190,7 +190,7 @@ class RefinedCorners:
     are_corners_fitted: bool
     remaining_edge_shift_sigma_px: float = 0.0
     blurriest_side_blur_sigma_px: float = 0.0
-    removed_edge_shift: EdgeShift | None = None
+    removed_edge_shift: EdgeShiftEstimate | None = None
     cov_px2: Array | None = None
     row_jitter_sigma_px: float = 0.0
     sharpest_side_blur_sigma_px: float = math.inf

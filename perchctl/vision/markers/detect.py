@@ -76,7 +76,7 @@ from perchctl.vision.types import (
     CameraModel,
     Detection,
     Detections,
-    EdgeShift,
+    EdgeShiftEstimate,
     Frame,
     MarkerName,
     PictureKind,
@@ -125,7 +125,7 @@ class DetectionPrior:
     blurred_fit_attempt_index: int | None
     was_target_seen_recently: bool
     was_target_truncated: bool
-    previous_edge_shift: EdgeShift | None
+    previous_edge_shift: EdgeShiftEstimate | None
     measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None
 
 
@@ -633,7 +633,7 @@ def _make_detection(
         r.remaining_edge_shift_sigma_px,
         cov_px2=r.cov_px2,
         row_jitter_sigma_px=r.row_jitter_sigma_px,
-        horizontal_side_extra_sigma_px=interpolated_field_edge_sigma_px(
+        horizontal_side_deinterlacing_sigma_px=interpolated_field_edge_sigma_px(
             r.sharpest_side_blur_sigma_px
         )
         if interpolated
@@ -805,7 +805,7 @@ _MAX_DERIVED_SMALL_MARKER_CORNER_ERROR_SIDES = 0.12
 def fit_side_lines(
     detector_input: DetectorInput,
     start_corners_px: Mapping[MarkerName, Array],
-    known_edge_shift: EdgeShift | None = None,
+    known_edge_shift: EdgeShiftEstimate | None = None,
 ) -> _FoundCorners:
     """Fit the four sides of each marker, starting at `start_corners_px` (4, 2) in the distorted
     image, and return the markers whose four sides are straight. The cells are not checked, so a
@@ -832,7 +832,7 @@ def fit_side_lines(
 def refine_expected_markers(
     detector_input: DetectorInput,
     expected_corners_px: Mapping[MarkerName, Array],
-    known_edge_shift: EdgeShift | None = None,
+    known_edge_shift: EdgeShiftEstimate | None = None,
 ) -> _FoundCorners:
     """Measure the expected markers, with corners (4, 2) px, by edge fits. Return the markers whose
     sides and cells the image confirms.
@@ -865,7 +865,7 @@ def add_partly_visible_markers(
     detector_input: DetectorInput,
     expected_corners_px: Mapping[MarkerName, Array],
     found_corners: _FoundCorners,
-    known_edge_shift: EdgeShift | None = None,
+    known_edge_shift: EdgeShiftEstimate | None = None,
 ) -> _FoundCorners:
     """Return the markers in `found_corners`, plus each marker in `expected_corners_px`, (4, 2) px
     each, whose visible part could be fitted.
@@ -991,7 +991,8 @@ def _average_detections(first: Detection, second: Detection) -> Detection:
         row_jitter_sigma_px=half_root_sum_square(
             first.row_jitter_sigma_px, second.row_jitter_sigma_px
         ),
-        horizontal_side_extra_sigma_px=half_root_sum_square(
-            first.horizontal_side_extra_sigma_px, second.horizontal_side_extra_sigma_px
+        horizontal_side_deinterlacing_sigma_px=half_root_sum_square(
+            first.horizontal_side_deinterlacing_sigma_px,
+            second.horizontal_side_deinterlacing_sigma_px,
         ),
     )

@@ -56,7 +56,7 @@ from perchctl.vision.markers.corners import (
     signed_double_area_clockwise,
 )
 from perchctl.vision.markers.pattern import CellsAlongBorder
-from perchctl.vision.types import CameraModel, EdgeShift
+from perchctl.vision.types import CameraModel, EdgeShiftEstimate
 
 # --- Grey profiles across the sides of markers ---
 
@@ -233,7 +233,7 @@ def refine_corners_by_lines(
     raw_corners_px: Array,
     cells_along_border: Sequence[CellsAlongBorder],
     camera: CameraModel,
-    known_edge_shift: EdgeShift | None = None,
+    known_edge_shift: EdgeShiftEstimate | None = None,
 ) -> list[RefinedCorners | None]:
     """Fit lines to the sides of m markers with corners (m, 4, 2) px in the distorted image and
     intersect them to get refined corners. Return one result for each marker, in the same order.
@@ -277,7 +277,7 @@ def _refine_corners_by_lines_once(
     raw_corners_px: Array,
     cells_along_border: Sequence[CellsAlongBorder],
     camera: CameraModel,
-    known_edge_shift: EdgeShift | None,
+    known_edge_shift: EdgeShiftEstimate | None,
 ) -> list[RefinedCorners | None]:
     found: list[RefinedCorners | None] = [None] * len(raw_corners_px)
     markers = prepare_marker_sides(raw_corners_px, cells_along_border, camera)
@@ -305,7 +305,7 @@ def _refine_corners_by_lines_once(
         shift = _measure_edge_shift(
             markers, outer_edges, inner_edges, line_nx_ny_c, rms_residual_px, corners
         )
-    applied = shift or EdgeShift(
+    applied = shift or EdgeShiftEstimate(
         0.0, edge_shift_prior_sigma_px(float(outer_edges.profile_greys[:, :, -1].mean()))
     )
     if applied.white_growth_per_edge_px != 0.0:
@@ -426,7 +426,7 @@ def _measure_edge_shift(
     line_nx_ny_c: Array,
     rms_residual_px: Array,
     corners_normalised: Array,
-) -> EdgeShift | None:
+) -> EdgeShiftEstimate | None:
     """Measure by how many pixels white has grown over black, from the width of the black border of
     the marker with the widest cells. `line_nx_ny_c` (4m, 3) and `rms_residual_px` (4m,) are the
     results of `_fit_lines`; `corners_normalised` (m, 4, 2) are the intersections of these lines.
@@ -465,7 +465,7 @@ def _measure_edge_shift(
     mass = w.sum(axis=1)
     some = mass > _MIN_PROFILE_WEIGHT_SUM_PER_SIDE
     if not some.any():
-        return EdgeShift(0.0, prior_px)
+        return EdgeShiftEstimate(0.0, prior_px)
     # If the sheet is curled, the outer edges move further than the inner ones, and the ends of a
     # side move further than its middle.
     bent_px = (
@@ -490,7 +490,7 @@ def _measure_edge_shift(
         rim.print_edge_sigma_cells * cell_size_px
     ) ** 2
     prior = prior_px**2
-    return EdgeShift(
+    return EdgeShiftEstimate(
         white_growth_per_edge_px=shift * prior / (prior + variance),
         sigma_px=(1.0 / variance + 1.0 / prior) ** -0.5,
     )

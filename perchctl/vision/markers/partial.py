@@ -71,7 +71,7 @@ from perchctl.vision.markers.pattern import (
     MIN_MATCHING_CELL_FRACTION,
     MarkerPattern,
 )
-from perchctl.vision.types import CameraModel, EdgeShift, MarkerName
+from perchctl.vision.types import CameraModel, EdgeShiftEstimate, MarkerName
 
 # With smaller cells, a part of a side carries no information.
 MIN_CELL_FOR_PARTIAL_FIT_PX = 4.0
@@ -92,7 +92,7 @@ def fit_partly_visible_marker(
     name: MarkerName,
     start_corners_px: Array,
     identified_by: IdentificationEvidence,
-    known_edge_shift: EdgeShift | None = None,
+    known_edge_shift: EdgeShiftEstimate | None = None,
 ) -> RefinedCorners | None:
     """Fit a marker to its visible part, starting at `start_corners_px` (4, 2) in the distorted
     image. Corners may be outside the image.
@@ -127,7 +127,8 @@ def fit_partly_visible_marker(
             return None
         A, N, g = _make_edge_normal_equations(
             visible_edges,
-            known_edge_shift or EdgeShift(0.0, edge_shift_prior_sigma_px(visible_edges.white_grey)),
+            known_edge_shift
+            or EdgeShiftEstimate(0.0, edge_shift_prior_sigma_px(visible_edges.white_grey)),
         )
         step = np.asarray(np.linalg.solve(N, g), dtype=np.float64)
         p = step[:8]
@@ -163,7 +164,7 @@ def is_fully_visible(detector_input: DetectorInput, corners: RefinedCorners) -> 
 
 
 def _make_edge_normal_equations(
-    visible_edges: VisibleEdges, edge_shift_prior: EdgeShift
+    visible_edges: VisibleEdges, edge_shift_prior: EdgeShiftEstimate
 ) -> tuple[Array, Array, Array]:
     """Set up one Gauss-Newton step that moves the square to the visible edges, each of which is
     measured on n profiles (short lines across it, along which the image is sampled). The nine
