@@ -198,8 +198,8 @@ def expected_outcomes() -> str:
 def corner_methods() -> str:
     """A Markdown table of the methods that find corners, in the order in which they are tried."""
     rows = (
-        f"| [{method.name}](#{method.name.lower().replace(' ', '-')}) | {method.requirements_text} "
-        f"| {method.cost_text} | {method.run_condition_text} |"
+        f"| [{method.name}](#{method.name.lower().replace(' ', '-')}) | {method.docs_prerequisites}"
+        f" | {method.docs_typical_time} | {method.docs_run_condition} |"
         for method in CORNER_METHODS
     )
     return "\n".join(["| method | needs | cost | used when |", "|---|---|---|---|", *rows])

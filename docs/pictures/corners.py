@@ -121,8 +121,8 @@ def cut_view_fit(file: Path) -> None:
     small = SETUP.patterns["small"]
     outline = make_outline(
         _LARGE.drawing,
-        _LARGE.cells_along_border.print_edge_sigma_cells,
-        small.cells_along_border.print_edge_sigma_cells,
+        _LARGE.cells_along_border.printed_edge_position_sigma_cells,
+        small.cells_along_border.printed_edge_position_sigma_cells,
     )
     R, t = cv2.Rodrigues(view.pose[0])[0], view.pose[1] / 0.075
     start = RigidPose(np.asarray(R) @ np.diag([1.0, -1.0, -1.0]), t)

@@ -69,8 +69,8 @@ def test_they_show_all_that_matters() -> None:
 @pytest.mark.parametrize(
     ("module", "name"),
     [
-        (edge_fit, "_EDGE_SHIFT_PRIOR_SIGMA_PX"),  # the fit of edges
-        pytest.param(edge_fit, "MIN_LINE_SIGMA_PX", marks=pytest.mark.long),
+        (edge_fit, "_BLOOMING_EDGE_SHIFT_PRIOR_SIGMA_PX"),  # the fit of edges
+        pytest.param(edge_fit, "FITTED_LINE_SIGMA_LOWER_BOUND_PX", marks=pytest.mark.long),
         pytest.param(pose, "_CORNER_SIGMA_PRIOR_DOF", marks=pytest.mark.long),  # the pose
         (the_filter, "_ACCELERATION_CORRELATION_TIME_S"),
     ],

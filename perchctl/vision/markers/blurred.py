@@ -36,12 +36,12 @@ from perchctl.vision.markers.corners import (
 )
 from perchctl.vision.markers.detector import DetectorInput, make_quad_detector
 from perchctl.vision.markers.edge_fit import (
-    CORNER_SIGMA_IF_WHITE_CLIPPED_PX,
-    MIN_CLIPPED_GREY,
-    MIN_CLIPPED_WHITE_FRACTION,
+    EXTRA_CORNER_SIGMA_IF_WHITE_CLIPPED_PX,
+    MIN_CLIPPED_FRACTION_TO_COUNT_WHITE_AS_CLIPPED,
+    MIN_GREY_TO_COUNT_AS_CLIPPED,
 )
 from perchctl.vision.markers.pattern import (
-    MIN_MARKER_SIDE_PX,
+    MIN_MARKER_SIDE_TO_IDENTIFY_PX,
     MarkerPattern,
     correlate_pattern_rotations,
 )
@@ -49,21 +49,21 @@ from perchctl.vision.markers.photometric_fit import DrawingAlignment, align_draw
 from perchctl.vision.types import MARKERS, MarkerName
 
 # Initial guesses of the blur: at an expected position, and at a quadrilateral found in the image.
-_INITIAL_BLUR_SIGMAS_PX, _QUAD_INITIAL_BLUR_SIGMA_PX = (1.5, 3.0), 2.0
+_INITIAL_BLUR_SIGMAS_AT_EXPECTED_POSITION_PX, _INITIAL_BLUR_SIGMA_AT_FOUND_QUAD_PX = (1.5, 3.0), 2.0
 # Largest error of a marker's expected position.
-_MAX_EXPECTED_POSITION_ERROR_PX, _MAX_EXPECTED_POSITION_ERROR_SIDES = 10.0, 0.5
+_MIN_TEMPLATE_SEARCH_HALF_WIDTH_PX, _TEMPLATE_SEARCH_HALF_WIDTH_SIDES = 10.0, 0.5
 _MAX_TEMPLATE_SIZE_PX, _MIN_TEMPLATE_SIZE_PX = 96.0, 6
-_MIN_QUAD_CORRELATION = 0.5
+_MIN_QUAD_CORRELATION_TO_TRY_FIT = 0.5
 # Minimum correlation at an expected position. Textures seldom reach this correlation; each texture
 # that does costs the time of a fit.
-_MIN_EXPECTED_MARKER_CORRELATION = 0.45
+_MIN_EXPECTED_MARKER_CORRELATION_TO_TRY_FIT = 0.45
 _MAX_QUADS_TO_FIT = 3
 # Whiteness, 0 to 1, of areas with unknown content: inside the marker, and beyond the paper.
-_TEMPLATE_CENTRE_WHITENESS, _TEMPLATE_OUTSIDE_WHITENESS = 0.3, 0.6
+_TEMPLATE_SMALL_MARKER_AREA_WHITENESS, _TEMPLATE_OFF_PAPER_WHITENESS = 0.3, 0.6
 # Candidates closer to each other than this fraction of a side count as one.
-_MAX_DUPLICATE_DISTANCE_SIDES = 0.15
+_MAX_CENTRE_DISTANCE_TO_COUNT_AS_DUPLICATE_SIDES = 0.15
 # Distance from the marker's centre up to which the surroundings are certainly paper.
-_MIN_PAPER_HALF_WIDTH_HALF_SIDES = 1.3
+_ASSUMED_PAPER_HALF_WIDTH_HALF_SIDES = 1.3
 
 
 def find_expected_blurred_marker(
@@ -84,20 +84,24 @@ def find_expected_blurred_marker(
     """
     image, patterns = detector_input.image, detector_input.setup.patterns
     blurs_px = (
-        _INITIAL_BLUR_SIGMAS_PX
+        _INITIAL_BLUR_SIGMAS_AT_EXPECTED_POSITION_PX
         if blurred_fit_attempt_index is None
-        else (_INITIAL_BLUR_SIGMAS_PX[blurred_fit_attempt_index % len(_INITIAL_BLUR_SIGMAS_PX)],)
+        else (
+            _INITIAL_BLUR_SIGMAS_AT_EXPECTED_POSITION_PX[
+                blurred_fit_attempt_index % len(_INITIAL_BLUR_SIGMAS_AT_EXPECTED_POSITION_PX)
+            ],
+        )
     )
     for name in MARKERS:
         corners = expected_corners_px.get(name)
         if corners is None or not is_inside_image(corners, image.shape):
             continue
-        if mean_side_px(corners) < MIN_MARKER_SIDE_PX:
+        if mean_side_px(corners) < MIN_MARKER_SIDE_TO_IDENTIFY_PX:
             continue
         start = _align_by_correlation(image, corners, patterns[name])
         if (
             correlate_pattern_rotations(image, start, patterns[name])[0]
-            < _MIN_EXPECTED_MARKER_CORRELATION
+            < _MIN_EXPECTED_MARKER_CORRELATION_TO_TRY_FIT
         ):
             continue
         for blur_px in blurs_px:
@@ -116,7 +120,10 @@ def find_blurred_marker(detector_input: DetectorInput) -> dict[MarkerName, Refin
     quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
     for name, corners_px in _rank_quads(image, quads, setup.patterns):
         seen = align_marker(
-            detector_input, name, corners_px, initial_blur_sigma_px=_QUAD_INITIAL_BLUR_SIGMA_PX
+            detector_input,
+            name,
+            corners_px,
+            initial_blur_sigma_px=_INITIAL_BLUR_SIGMA_AT_FOUND_QUAD_PX,
         )
         if seen is not None:
             return {name: seen}
@@ -127,10 +134,10 @@ def _rank_quads(
     image: NDArray[np.uint8], quads: Array, patterns: Mapping[MarkerName, MarkerPattern]
 ) -> list[tuple[MarkerName, Array]]:
     """Return at most `_MAX_QUADS_TO_FIT` of the quadrilaterals `quads` (m, 4, 2) px: those whose
-    cells in the image have a correlation above `_MIN_QUAD_CORRELATION` with a marker's, best first
-    and without duplicates. Each is returned with the marker's name; its corners are in the same
-    order as the marker's."""
-    quads = quads[side_lengths_px(quads).min(axis=1) >= MIN_MARKER_SIDE_PX]
+    cells in the image have a correlation above `_MIN_QUAD_CORRELATION_TO_TRY_FIT` with a marker's,
+    best first and without duplicates. Each is returned with the marker's name; its corners are in
+    the same order as the marker's."""
+    quads = quads[side_lengths_px(quads).min(axis=1) >= MIN_MARKER_SIDE_TO_IDENTIFY_PX]
     if len(quads) == 0:
         return []
     found: list[tuple[float, MarkerName, Array]] = []
@@ -138,14 +145,14 @@ def _rank_quads(
         like = np.array(
             [correlate_pattern_rotations(image, quad, patterns[name]) for quad in quads]
         )
-        for i in np.flatnonzero(like.max(axis=1) > _MIN_QUAD_CORRELATION):
+        for i in np.flatnonzero(like.max(axis=1) > _MIN_QUAD_CORRELATION_TO_TRY_FIT):
             roll = int(like[i].argmax())
             found.append((float(like[i, roll]), name, np.roll(quads[i], roll, axis=0)))
     chosen: list[tuple[MarkerName, Array]] = []
     for _, name, corners_px in sorted(found, key=lambda each: -each[0]):
         middle, room_px = (
             corners_px.mean(axis=0),
-            _MAX_DUPLICATE_DISTANCE_SIDES * mean_side_px(corners_px),
+            _MAX_CENTRE_DISTANCE_TO_COUNT_AS_DUPLICATE_SIDES * mean_side_px(corners_px),
         )
         if not any(
             name == other and float(np.abs(there.mean(axis=0) - middle).max()) < room_px
@@ -164,9 +171,9 @@ def _align_by_correlation(
     search, the corners are returned unchanged."""
     side_px = mean_side_px(corners_px)
     scale = min(1.0, _MAX_TEMPLATE_SIZE_PX / (2.0 * side_px))
-    reach = max(_MAX_EXPECTED_POSITION_ERROR_PX, _MAX_EXPECTED_POSITION_ERROR_SIDES * side_px)
+    reach = max(_MIN_TEMPLATE_SEARCH_HALF_WIDTH_PX, _TEMPLATE_SEARCH_HALF_WIDTH_SIDES * side_px)
     centre = corners_px.mean(axis=0)
-    half = float(np.abs(corners_px - centre).max()) * _MIN_PAPER_HALF_WIDTH_HALF_SIDES
+    half = float(np.abs(corners_px - centre).max()) * _ASSUMED_PAPER_HALF_WIDTH_HALF_SIDES
     h, w = image.shape
     low = np.clip(np.floor(centre - half - reach), 0, (w - 1, h - 1)).astype(int)
     high = np.clip(np.ceil(centre + half + reach) + 1, 1, (w, h)).astype(int)
@@ -206,9 +213,9 @@ def _render_template(
     if pattern.drawing.small_marker_cell_whiteness is not None:
         white[
             np.abs(sample_points_half_sides).max(axis=2) < pattern.drawing.small_to_large_side_ratio
-        ] = _TEMPLATE_CENTRE_WHITENESS
-    white[np.abs(sample_points_half_sides).max(axis=2) > _MIN_PAPER_HALF_WIDTH_HALF_SIDES] = (
-        _TEMPLATE_OUTSIDE_WHITENESS
+        ] = _TEMPLATE_SMALL_MARKER_AREA_WHITENESS
+    white[np.abs(sample_points_half_sides).max(axis=2) > _ASSUMED_PAPER_HALF_WIDTH_HALF_SIDES] = (
+        _TEMPLATE_OFF_PAPER_WHITENESS
     )
     sigma = max(1.0, 0.5 * side_px / n)
     return np.asarray(cv2.GaussianBlur(white.astype(np.float32), (0, 0), sigma))
@@ -217,16 +224,16 @@ def _render_template(
 # --- Fit a marker's drawing, and accept the marker only if the image matches beyond doubt ---
 
 
-_MIN_ALIGNED_CORNER_SIGMA_PX = 0.015
+_FITTED_CORNER_SIGMA_LOWER_BOUND_PX = 0.015
 # The error of the corners grows with the blur, because no image equals its drawing with a uniform
 # blur.
-_CORNER_SIGMA_TO_BLUR_SIGMA_RATIO = 0.012
-_MIN_INNER_PATTERN_CORRELATION, _MIN_FIT_CORRELATION = 0.9, 0.9
+_EXTRA_CORNER_SIGMA_PER_BLUR_SIGMA = 0.012
+_MIN_INNER_PATTERN_CORRELATION_TO_CONFIRM_MARKER, _MIN_FIT_CORRELATION_TO_CONFIRM_MARKER = 0.9, 0.9
 _MIN_PATTERN_TO_BORDER_CONTRAST_RATIO, _MAX_PATTERN_TO_BORDER_CONTRAST_RATIO = 0.6, 1.6
-_MAX_CELL_GREY_DEVIATION_TO_CONTRAST_RATIO = 0.3
-_MAX_OPPOSITE_COLOUR_LIKENESS, _MAX_OPPOSITE_COLOUR_LIKENESS_SIGMA = 0.4, 0.35
-_MAX_ALIGNED_CORNER_SIGMA_SIDES = 0.06
-_ALWAYS_ALLOWED_MOTION_FROM_START_PX = 3.0
+_MAX_CELL_GREY_RESIDUAL_TO_CONTRAST_RATIO = 0.3
+_MAX_WORST_CELL_OPPOSITE_COLOUR_LIKENESS, _MAX_CELL_OPPOSITE_COLOUR_LIKENESS_SIGMA = 0.4, 0.35
+_MAX_CORNER_SIGMA_TO_ACCEPT_FIT_SIDES = 0.06
+_ALWAYS_ALLOWED_CORNER_MOTION_FROM_START_PX = 3.0
 # Limits of the mean side after the fit, divided by the mean side at its start.
 _MIN_FITTED_TO_START_SIDE_RATIO, _MAX_FITTED_TO_START_SIDE_RATIO = 0.6, 1.6
 _MIN_SHORTEST_TO_LONGEST_SIDE_RATIO = 0.6
@@ -238,7 +245,7 @@ def align_marker(
     start_corners_px: Array,
     max_motion_from_start_sides: float = 0.6,
     initial_blur_sigma_px: float = 1.5,
-    max_corner_sigma_sides: float = _MAX_ALIGNED_CORNER_SIGMA_SIDES,
+    max_corner_sigma_sides: float = _MAX_CORNER_SIGMA_TO_ACCEPT_FIT_SIDES,
     must_exclude_other_codewords: bool = True,
 ) -> RefinedCorners | None:
     """Fit a marker's drawing to the image and return its corners; None if the image does not match
@@ -253,7 +260,7 @@ def align_marker(
     if the other marker already identifies this one.
     """
     side_px = mean_side_px(start_corners_px)
-    if not side_px >= MIN_MARKER_SIDE_PX:
+    if not side_px >= MIN_MARKER_SIDE_TO_IDENTIFY_PX:
         return None
     image, drawing = detector_input.image, detector_input.setup.patterns[name].drawing
     alignment = align_drawing(
@@ -263,8 +270,8 @@ def align_marker(
         alignment is None
         or not is_alignment_confirmed(alignment, max_corner_sigma_sides)
         or (must_exclude_other_codewords and not are_other_codewords_excluded(alignment))
-        or alignment.largest_motion_from_start_px
-        > max(max_motion_from_start_sides * side_px, _ALWAYS_ALLOWED_MOTION_FROM_START_PX)
+        or alignment.largest_corner_motion_from_start_px
+        > max(max_motion_from_start_sides * side_px, _ALWAYS_ALLOWED_CORNER_MOTION_FROM_START_PX)
     ):
         return None
     # The fitted marker must still be a square of about the same size and orientation.
@@ -281,22 +288,26 @@ def align_marker(
     ):
         return None
     sigma_px = math.hypot(
-        max(alignment.corner_sigma_px, _MIN_ALIGNED_CORNER_SIGMA_PX),
-        _CORNER_SIGMA_TO_BLUR_SIGMA_RATIO * alignment.blur_sigma_px,
+        max(alignment.corner_sigma_px, _FITTED_CORNER_SIGMA_LOWER_BOUND_PX),
+        _EXTRA_CORNER_SIGMA_PER_BLUR_SIGMA * alignment.blur_sigma_px,
     )
     (left, top), (right, bottom) = (
         alignment.corners_px.min(axis=0),
         alignment.corners_px.max(axis=0),
     )
     part = image[max(int(top), 0) : int(bottom) + 1, max(int(left), 0) : int(right) + 1]
-    if int(np.count_nonzero(part > MIN_CLIPPED_GREY)) > MIN_CLIPPED_WHITE_FRACTION * part.size:
+    if (
+        int(np.count_nonzero(part > MIN_GREY_TO_COUNT_AS_CLIPPED))
+        > MIN_CLIPPED_FRACTION_TO_COUNT_WHITE_AS_CLIPPED * part.size
+    ):
         # The illumination model does not explain clipped white.
-        sigma_px = math.hypot(sigma_px, CORNER_SIGMA_IF_WHITE_CLIPPED_PX)
+        sigma_px = math.hypot(sigma_px, EXTRA_CORNER_SIGMA_IF_WHITE_CLIPPED_PX)
     return RefinedCorners(alignment.corners_px, sigma_px, True)
 
 
 def is_alignment_confirmed(
-    alignment: DrawingAlignment, max_corner_sigma_sides: float = _MAX_ALIGNED_CORNER_SIGMA_SIDES
+    alignment: DrawingAlignment,
+    max_corner_sigma_sides: float = _MAX_CORNER_SIGMA_TO_ACCEPT_FIT_SIDES,
 ) -> bool:
     """True if the image matches the fitted drawing, and if the standard deviation of the corners is
     below `max_corner_sigma_sides` side lengths. To match, the image must correlate with the drawing
@@ -308,13 +319,13 @@ def is_alignment_confirmed(
     plausible contrast; with a marker, it was above 0.95.
     """
     return (
-        alignment.inner_pattern_correlation > _MIN_INNER_PATTERN_CORRELATION
-        and alignment.fit_correlation > _MIN_FIT_CORRELATION
+        alignment.inner_pattern_correlation > _MIN_INNER_PATTERN_CORRELATION_TO_CONFIRM_MARKER
+        and alignment.fit_correlation > _MIN_FIT_CORRELATION_TO_CONFIRM_MARKER
         and _MIN_PATTERN_TO_BORDER_CONTRAST_RATIO
         < alignment.pattern_to_border_contrast_ratio
         < _MAX_PATTERN_TO_BORDER_CONTRAST_RATIO
-        and alignment.largest_cell_grey_deviation_to_contrast_ratio
-        < _MAX_CELL_GREY_DEVIATION_TO_CONTRAST_RATIO
+        and alignment.largest_cell_grey_residual_to_contrast_ratio
+        < _MAX_CELL_GREY_RESIDUAL_TO_CONTRAST_RATIO
         and alignment.corner_sigma_px < max_corner_sigma_sides * mean_side_px(alignment.corners_px)
     )
 
@@ -322,11 +333,12 @@ def is_alignment_confirmed(
 def are_other_codewords_excluded(alignment: DrawingAlignment) -> bool:
     """True if flipping any single bit of the codeword would make the drawing fit the image clearly
     worse. How much each cell looks like the opposite colour is measured from 0 (as drawn) to 1
-    (flipped). This measure must be below `_MAX_OPPOSITE_COLOUR_LIKENESS`, and its standard
-    deviation below `_MAX_OPPOSITE_COLOUR_LIKENESS_SIGMA`, for every cell. In tests,
+    (flipped). This measure must be below `_MAX_WORST_CELL_OPPOSITE_COLOUR_LIKENESS`, and its
+    standard deviation below `_MAX_CELL_OPPOSITE_COLOUR_LIKENESS_SIGMA`, for every cell. In tests,
     `is_alignment_confirmed` wrongly accepted 36 markers with other codewords; in each of them, the
     measure was above 0.5 for at least one cell."""
     return (
-        alignment.worst_cell_opposite_colour_likeness < _MAX_OPPOSITE_COLOUR_LIKENESS
-        and alignment.largest_opposite_colour_likeness_sigma < _MAX_OPPOSITE_COLOUR_LIKENESS_SIGMA
+        alignment.worst_cell_opposite_colour_likeness < _MAX_WORST_CELL_OPPOSITE_COLOUR_LIKENESS
+        and alignment.largest_opposite_colour_likeness_sigma
+        < _MAX_CELL_OPPOSITE_COLOUR_LIKENESS_SIGMA
     )

@@ -154,7 +154,7 @@ OPENCV_DETECTOR_CORNER_SIGMA_PX = 0.6
 """Standard deviation of corners from OpenCV's detector, px."""
 SUBPIX_CORNER_SIGMA_PX = 0.25
 """Standard deviation of corners from `cv2.cornerSubPix`, px."""
-CORNER_SIGMA_FROM_OTHER_MARKER_PX = 0.6
+SIGMA_OF_CORNERS_DERIVED_FROM_OTHER_MARKER_PX = 0.6
 """Standard deviation of corners that are derived from the other marker, not measured, px."""
 
 

@@ -47,31 +47,37 @@ from perchctl.vision.markers.detector import (
     is_any_marker_part_hidden,
     make_detector_setup,
 )
-from perchctl.vision.markers.edge_fit import GRADIENT_POSITIONS_HALF_LENGTHS, sample_profiles
+from perchctl.vision.markers.edge_fit import (
+    GRADIENT_POSITIONS_ALONG_PROFILE_HALF_LENGTHS,
+    sample_profiles,
+)
 from perchctl.vision.markers.pattern import MarkerDrawing, MarkerPattern, render_cells
 from perchctl.vision.markers.photometric_fit import correlation_from_residual, make_sampling_grid
 from perchctl.vision.types import CameraModel, MarkerName
 
-MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S = 0.5
+MAX_TARGET_MEASUREMENT_AGE_TO_TRY_TRUNCATED_FIT_S = 0.5
 """Maximum time since the target was last measured, s. After a longer time, a part of the target is
 not sufficient evidence of the target."""
 # Distance from the image border within which an expected marker may or may not be truncated.
-_MAX_EXPECTED_CORNER_ERROR_PX = 40
+_ASSUMED_MAX_CORNER_PREDICTION_ERROR_PX = 40
 # If the cells of the small marker are smaller, the large marker is in view.
-_MIN_SMALL_MARKER_CELL_TO_FIT_PX = 8.0
-_MIN_COARSE_CORRELATION = 0.6  # Correlation required after the predicted pose has been shifted.
-_SUFFICIENT_COARSE_CORRELATION = 0.95  # Correlation above which no other range is tried.
+_MIN_SMALL_MARKER_CELL_SIZE_TO_TRY_FIT_PX = 8.0
+# Correlation required after the predicted pose has been shifted.
+_MIN_COARSE_CORRELATION_TO_START_FIT = 0.6
+# Correlation above which no other range is tried.
+_MIN_COARSE_CORRELATION_TO_STOP_SEARCH = 0.95
 # Sizes of the target in the image that are tried, relative to its predicted size.
-_TARGET_IMAGE_SCALE_CANDIDATES = (1.0, 0.94, 1.06)
-_MIN_FITTED_DRAWING_CORRELATION, _MIN_FITTED_DRAWING_CONTRAST_GREY = 0.9, 20.0
-_MIN_FOUND_EDGE_POINT_FRACTION = 0.75  # fraction of the edge points in view that must be found
+_TARGET_SCALES_TO_TRY_RELATIVE_TO_PREDICTION = (1.0, 0.94, 1.06)
+_MIN_DRAWING_CORRELATION_TO_ACCEPT_FIT, _MIN_DRAWING_CONTRAST_TO_ACCEPT_FIT_GREY = 0.9, 20.0
+# Fraction of the edge points in view that must be found.
+_MIN_FOUND_EDGE_POINT_FRACTION_TO_ACCEPT_FIT = 0.75
 _MAX_TRUNCATED_FIT_RMS_RESIDUAL_PX = 1.2
-_MAX_TRANSLATION_SIGMA_HALF_SIDES = 0.04
-_MIN_CORNER_SIGMA_PX = 0.02
+_MAX_TRANSLATION_SIGMA_TO_ACCEPT_FIT_HALF_SIDES = 0.04
+_CORNER_SIGMA_ADDED_IN_QUADRATURE_PX = 0.02
 # The small marker is reported if at least this number of its edge points is found.
 _MIN_EDGE_POINTS_TO_REPORT_SMALL_MARKER = 12
 # The lens model is valid where its inverse exists.
-_MAX_LENS_INVERSION_ERROR_NORMALISED = 1e-3
+_MAX_LENS_MODEL_ROUND_TRIP_ERROR_NORMALISED = 1e-3
 # Rotation from the coordinates of the drawing to the axes of the marker.
 _R_MARKER_DRAWING = np.diag([1.0, -1.0, -1.0])
 
@@ -93,9 +99,9 @@ def is_target_possibly_truncated(
     image_shape: tuple[int, ...],
     hidden_mask: HiddenMask | None = None,
 ) -> bool:
-    """True if no expected marker is certain to be completely visible: for each of them, a corner
-    is outside the image or close to its border (`_MAX_EXPECTED_CORNER_ERROR_PX`, 40 px), or the
-    vehicle's gear hides a part of the marker. False if no marker is expected.
+    """True if no expected marker is certain to be completely visible: for each of them, a corner is
+    outside the image or close to its border (`_ASSUMED_MAX_CORNER_PREDICTION_ERROR_PX`, 40 px), or
+    the vehicle's gear hides a part of the marker. False if no marker is expected.
 
     `expected_corners_px` contains the predicted corners of each marker, (4, 2) px.
     `image_shape` (h, w) is that of the image. `hidden_mask` (h, w) is True for pixels that the
@@ -104,7 +110,7 @@ def is_target_possibly_truncated(
     whole = [
         corners
         for corners in expected_corners_px.values()
-        if is_inside_image(corners, image_shape, _MAX_EXPECTED_CORNER_ERROR_PX)
+        if is_inside_image(corners, image_shape, _ASSUMED_MAX_CORNER_PREDICTION_ERROR_PX)
     ]
     return bool(expected_corners_px) and all(
         is_any_marker_part_hidden(hidden_mask, c) for c in whole
@@ -116,9 +122,10 @@ def can_complete_marker_be_in_view(
 ) -> bool:
     """True if at least one expected marker, with corners (4, 2) px, may be completely in an image
     with the given `image_shape` (h, w). Because predictions are uncertain, a marker counts even if
-    its predicted corners are up to 40 px (`_MAX_EXPECTED_CORNER_ERROR_PX`) outside the image."""
+    its predicted corners are up to 40 px (`_ASSUMED_MAX_CORNER_PREDICTION_ERROR_PX`) outside the
+    image."""
     return any(
-        is_inside_image(corners, image_shape, -_MAX_EXPECTED_CORNER_ERROR_PX)
+        is_inside_image(corners, image_shape, -_ASSUMED_MAX_CORNER_PREDICTION_ERROR_PX)
         for corners in expected_corners_px.values()
     )
 
@@ -132,8 +139,8 @@ def fit_truncated_markers(
     found, otherwise of the large one.
 
     The result is empty if the target has no small marker, if the small marker's cells are narrower
-    than 8 px (`_MIN_SMALL_MARKER_CELL_TO_FIT_PX`) in the image, if the image does not match the
-    target, or if it does not determine the target's position accurately enough.
+    than 8 px (`_MIN_SMALL_MARKER_CELL_SIZE_TO_TRY_FIT_PX`) in the image, if the image does not
+    match the target, or if it does not determine the target's position accurately enough.
     """
     image, camera, patterns = (
         detector_input.image,
@@ -154,7 +161,7 @@ def fit_truncated_markers(
         / len(centre)
         * camera.K[0, 0]
         / start.t_cam_drawing_half_sides[2]
-        < _MIN_SMALL_MARKER_CELL_TO_FIT_PX
+        < _MIN_SMALL_MARKER_CELL_SIZE_TO_TRY_FIT_PX
     ):
         return {}
     covered = (
@@ -168,7 +175,10 @@ def fit_truncated_markers(
     if pose_fit is None or not _is_pose_fit_reliable(pose_fit):
         return {}
     like, gain = correlate_drawing(pose_fit.pose.H_normalised_drawing, texture, coarse_image)
-    if like < _MIN_FITTED_DRAWING_CORRELATION or gain < _MIN_FITTED_DRAWING_CONTRAST_GREY:
+    if (
+        like < _MIN_DRAWING_CORRELATION_TO_ACCEPT_FIT
+        or gain < _MIN_DRAWING_CONTRAST_TO_ACCEPT_FIT_GREY
+    ):
         return {}
     name = _select_marker_to_report(pose_fit)
     corners = _project_marker_corners(
@@ -209,8 +219,8 @@ def _make_target_outline(patterns: Mapping[MarkerName, MarkerPattern]) -> Target
     large, small = patterns["large"], patterns["small"]
     return make_outline(
         large.drawing,
-        large.cells_along_border.print_edge_sigma_cells,
-        small.cells_along_border.print_edge_sigma_cells,
+        large.cells_along_border.printed_edge_position_sigma_cells,
+        small.cells_along_border.printed_edge_position_sigma_cells,
     )
 
 
@@ -251,43 +261,45 @@ def _search_near_pose(
     start: RigidPose, texture: DrawingTexture, coarse_image: CoarseUndistortedImage
 ) -> RigidPose | None:
     """Return the pose near `start` at which the drawing, rendered from `texture`, correlates best
-    with the coarse image; None if no pose has a correlation above 0.6 (`_MIN_COARSE_CORRELATION`).
+    with the coarse image; None if no pose has a correlation above 0.6
+    (`_MIN_COARSE_CORRELATION_TO_START_FIT`).
 
-    The search moves the drawing by up to 6 pixels of the coarse image (`_SEARCH_HALF_WIDTH_NODES`)
-    to each side, at the predicted size and at slightly smaller and larger sizes
-    (`_TARGET_IMAGE_SCALE_CANDIDATES`). It does not change the rotation, and stops at the first size
-    with a correlation above 0.95 (`_SUFFICIENT_COARSE_CORRELATION`).
+    The search moves the drawing by up to 6 pixels of the coarse image
+    (`_COARSE_SEARCH_HALF_WIDTH_NODES`) to each side, at the predicted size and at slightly smaller
+    and larger sizes (`_TARGET_SCALES_TO_TRY_RELATIVE_TO_PREDICTION`). It does not change the
+    rotation, and stops at the first size with a correlation above 0.95
+    (`_MIN_COARSE_CORRELATION_TO_STOP_SEARCH`).
     """
-    best, pose, lattice = _MIN_COARSE_CORRELATION, None, coarse_image.lattice
-    for growth in _TARGET_IMAGE_SCALE_CANDIDATES:
+    best, pose, lattice = _MIN_COARSE_CORRELATION_TO_START_FIT, None, coarse_image.lattice
+    for growth in _TARGET_SCALES_TO_TRY_RELATIVE_TO_PREDICTION:
         t = start.t_cam_drawing_half_sides * (1.0, 1.0, 1.0 / growth)
         wide = render_drawing(
             RigidPose(start.R_cam_drawing, t).H_normalised_drawing,
             texture,
             lattice,
-            _SEARCH_HALF_WIDTH_NODES,
+            _COARSE_SEARCH_HALF_WIDTH_NODES,
         )
         mask = coarse_image.is_node_visible.astype(np.float32)
         score = cv2.matchTemplate(wide, coarse_image.grey, cv2.TM_CCOEFF_NORMED, mask=mask)
         score = np.where(np.isfinite(score) & (np.abs(score) <= 1.001), score, -1.0)
         row, column = np.unravel_index(int(score.argmax()), score.shape)
         drift = (
-            _SEARCH_HALF_WIDTH_NODES - np.array([column, row], dtype=np.float64)
+            _COARSE_SEARCH_HALF_WIDTH_NODES - np.array([column, row], dtype=np.float64)
         ) * lattice.node_spacing_normalised
         if score[row, column] > best:
             best = float(score[row, column])
             pose = RigidPose(start.R_cam_drawing, t + np.append(drift * t[2], 0.0))
-        if best > _SUFFICIENT_COARSE_CORRELATION:
+        if best > _MIN_COARSE_CORRELATION_TO_STOP_SEARCH:
             break
     return pose
 
 
 def _is_pose_fit_reliable(pose_fit: PoseFit) -> bool:
     """True if at least 75 % of the visible edge points were found
-    (`_MIN_FOUND_EDGE_POINT_FRACTION`), if their RMS residual is below 1.2 px
+    (`_MIN_FOUND_EDGE_POINT_FRACTION_TO_ACCEPT_FIT`), if their RMS residual is below 1.2 px
     (`_MAX_TRUNCATED_FIT_RMS_RESIDUAL_PX`), and if the standard deviation of the translation along
     its most uncertain direction is below 0.04 half sides of the large marker
-    (`_MAX_TRANSLATION_SIGMA_HALF_SIDES`)."""
+    (`_MAX_TRANSLATION_SIGMA_TO_ACCEPT_FIT_HALF_SIDES`)."""
     spread = math.sqrt(
         max(
             float(np.linalg.eigvalsh(pose_fit.rotation_translation_cov_rad_half_sides[3:, 3:])[-1]),
@@ -296,9 +308,9 @@ def _is_pose_fit_reliable(pose_fit: PoseFit) -> bool:
     )
     return (
         pose_fit.found_edge_point_count
-        >= _MIN_FOUND_EDGE_POINT_FRACTION * pose_fit.visible_edge_point_count
+        >= _MIN_FOUND_EDGE_POINT_FRACTION_TO_ACCEPT_FIT * pose_fit.visible_edge_point_count
         and pose_fit.rms_residual_px < _MAX_TRUNCATED_FIT_RMS_RESIDUAL_PX
-        and spread < _MAX_TRANSLATION_SIGMA_HALF_SIDES
+        and spread < _MAX_TRANSLATION_SIGMA_TO_ACCEPT_FIT_HALF_SIDES
     )
 
 
@@ -328,12 +340,12 @@ def _project_marker_corners(
     corners_px = distort_to_px(x, camera)
     if (
         not np.abs(undistort_to_normalised(corners_px, camera) - x).max()
-        < _MAX_LENS_INVERSION_ERROR_NORMALISED
+        < _MAX_LENS_MODEL_ROUND_TRIP_ERROR_NORMALISED
     ):
         return None
     cov_px2 = (
         J @ pose_fit.rotation_translation_cov_rad_half_sides @ J.T
-        + _MIN_CORNER_SIGMA_PX** 2 * np.eye(8)
+        + _CORNER_SIGMA_ADDED_IN_QUADRATURE_PX** 2 * np.eye(8)
     )
     sigma_px = math.sqrt(float(np.trace(cov_px2)) / 8.0)
     return RefinedCorners(corners_px, sigma_px, True, cov_px2=cov_px2)
@@ -344,13 +356,13 @@ def _project_marker_corners(
 
 FloatImage = NDArray[np.float32]
 
-_LATTICE_COLUMNS = 80  # approximate number of nodes across the image
+_COARSE_LATTICE_NODES_ACROSS_IMAGE = 80  # approximate number of nodes across the image
 _SAMPLES_PER_LATTICE_NODE_AND_AXIS = 2
-_MAX_VIEW_RADIUS_NORMALISED = 1.5  # corresponds to 56 degrees off the optical axis
-_BORDER_POINTS_PER_IMAGE_SIDE = 40
+_MAX_LATTICE_XY_FROM_OPTICAL_AXIS_NORMALISED = 1.5  # corresponds to 56 degrees off the optical axis
+_BORDER_POINTS_TO_UNDISTORT_PER_IMAGE_SIDE = 40
 _VALID_LENS_RADIUS_TO_IMAGE_RADIUS_RATIO = 1.02
-_SEARCH_HALF_WIDTH_NODES = 6  # The search covers this number of nodes to each side.
-_MIN_VISIBLE_NODES_ON_PAPER = 200  # Minimum number of visible nodes on the paper.
+_COARSE_SEARCH_HALF_WIDTH_NODES = 6  # The search covers this number of nodes to each side.
+_MIN_VISIBLE_NODES_ON_PAPER_TO_CORRELATE = 200  # Minimum number of visible nodes on the paper.
 
 
 @dataclass(frozen=True, eq=False)
@@ -395,19 +407,22 @@ class CoarseUndistortedImage:
 def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
     """Return the regular grid of points (nodes) at which `make_coarse_image` computes the grey
     values of a downsampled image without lens distortion. The grid covers the camera's field of
-    view in normalised image coordinates, but at most 1.5 (`_MAX_VIEW_RADIUS_NORMALISED`) from the
-    optical axis in x and in y. The spacing is that of about 80 nodes across the image width
-    (`_LATTICE_COLUMNS`)."""
+    view in normalised image coordinates, but at most 1.5
+    (`_MAX_LATTICE_XY_FROM_OPTICAL_AXIS_NORMALISED`) from the optical axis in x and in y. The
+    spacing is that of about 80 nodes across the image width
+    (`_COARSE_LATTICE_NODES_ACROSS_IMAGE`)."""
     w, h = camera.size_px
-    s = np.linspace(0.0, 1.0, _BORDER_POINTS_PER_IMAGE_SIDE)
+    s = np.linspace(0.0, 1.0, _BORDER_POINTS_TO_UNDISTORT_PER_IMAGE_SIDE)
     low, high = np.zeros_like(s), np.ones_like(s)
     rim = np.concatenate([np.stack(p, 1) for p in ((s, low), (s, high), (low, s), (high, s))])
     rays = undistort_to_normalised(rim * (w - 1.0, h - 1.0), camera)
     rays = np.clip(
-        np.nan_to_num(rays, nan=0.0), -_MAX_VIEW_RADIUS_NORMALISED, _MAX_VIEW_RADIUS_NORMALISED
+        np.nan_to_num(rays, nan=0.0),
+        -_MAX_LATTICE_XY_FROM_OPTICAL_AXIS_NORMALISED,
+        _MAX_LATTICE_XY_FROM_OPTICAL_AXIS_NORMALISED,
     )
     reach = _VALID_LENS_RADIUS_TO_IMAGE_RADIUS_RATIO * float(np.hypot(*rays.T).max())
-    step = w / (_LATTICE_COLUMNS * float(camera.K[0, 0]))
+    step = w / (_COARSE_LATTICE_NODES_ACROSS_IMAGE * float(camera.K[0, 0]))
     nodes = np.maximum(np.ceil(np.ptp(rays, axis=0) / step).astype(int), 1)
     fine = [
         rays.min(axis=0)[k]
@@ -423,7 +438,9 @@ def make_coarse_lattice(camera: CameraModel) -> CoarseLattice:
     inside = np.isfinite(at).all(axis=1) & (np.hypot(x, y).ravel() < reach)
     inside &= (at > 0.0).all(axis=1) & (at < (w - 1, h - 1)).all(axis=1)
     at = np.where(inside[:, None], at, -1e3)
-    every = max(round(w / (_SAMPLES_PER_LATTICE_NODE_AND_AXIS * _LATTICE_COLUMNS)), 1)
+    every = max(
+        round(w / (_SAMPLES_PER_LATTICE_NODE_AND_AXIS * _COARSE_LATTICE_NODES_ACROSS_IMAGE)), 1
+    )
     size = (max(w // every, 1), max(h // every, 1))
     reduced = ((at + 0.5) * (size[0] / w, size[1] / h) - 0.5).astype(np.float32)
     shape = (
@@ -541,7 +558,7 @@ def correlate_drawing(
     of the large marker from the target's centre, to normalised image coordinates. The brightness
     and the contrast of the drawing, each with a gradient across the image, are first fitted to the
     image. Correlation and contrast are 0 if fewer than 200 visible nodes are on the paper
-    (`_MIN_VISIBLE_NODES_ON_PAPER`)."""
+    (`_MIN_VISIBLE_NODES_ON_PAPER_TO_CORRELATE`)."""
     lattice = coarse_image.lattice
     rows, columns = np.nonzero(coarse_image.is_node_visible)
     at = lattice.first_node_xy_normalised + lattice.node_spacing_normalised * np.stack(
@@ -551,9 +568,9 @@ def correlate_drawing(
         np.abs(
             apply_homography(np.asarray(np.linalg.inv(H_normalised_drawing), np.float64), at)
         ).max(axis=1)
-        < PAPER_REACH_FROM_CENTRE_LARGE_HALF_SIDES
+        < ASSUMED_PAPER_HALF_WIDTH_LARGE_HALF_SIDES
     )
-    if np.count_nonzero(on) < _MIN_VISIBLE_NODES_ON_PAPER:
+    if np.count_nonzero(on) < _MIN_VISIBLE_NODES_ON_PAPER_TO_CORRELATE:
         return DrawingMatch(0.0, 0.0)
     white = render_drawing(H_normalised_drawing, texture, lattice)[rows[on], columns[on]].astype(
         np.float64
@@ -569,14 +586,14 @@ def correlate_drawing(
 
 
 # Distance from the target's centre up to which there is certainly paper.
-PAPER_REACH_FROM_CENTRE_LARGE_HALF_SIDES = 1.25
+ASSUMED_PAPER_HALF_WIDTH_LARGE_HALF_SIDES = 1.25
 # Points along the side of a cell of the large and of the small marker.
-_POINTS_PER_LARGE_MARKER_CELL_SIDE, _POINTS_PER_SMALL_MARKER_CELL_SIDE = 24, 6
+_OUTLINE_POINTS_PER_LARGE_MARKER_CELL_SIDE, _OUTLINE_POINTS_PER_SMALL_MARKER_CELL_SIDE = 24, 6
 # Margin at both ends of a cell's side, where the corner of the next cell blurs the edge.
-_EDGE_END_MARGIN_CELLS = 0.15
+_OUTLINE_POINT_MARGIN_AT_EDGE_ENDS_CELLS = 0.15
 # Distance from the centre, in half sides of the small marker, within which it hides the large one.
-_OCCLUSION_REACH_FROM_CENTRE_SMALL_HALF_SIDES = 1.2
-_TEXTURE_SIZE_PX = 320
+_OMIT_LARGE_MARKER_EDGES_WITHIN_SMALL_HALF_SIDES = 1.2
+_DRAWING_TEXTURE_SIZE_PX = 320
 
 
 @dataclass(frozen=True, eq=False)
@@ -587,8 +604,8 @@ class TargetOutline:
         points_half_sides, edge_normal_to_white_in_drawing: points (n, 2), in half sides of the
             large marker from the target's centre (x right, y down on the paper), and unit normals
             (n, 2) from black to white.
-        line_index_per_point: number (n,) of the straight line that each point is on; points with
-            the same number are collinear.
+        printed_line_index_per_point: number (n,) of the straight line that each point is on; points
+            with the same number are collinear.
         printed_line_position_sigma_half_sides: standard deviation (n,) of the position of the
             printed line that each point is on, in half sides of the large marker.
         adjacent_cell_width_half_sides: width (n,) of a cell of the marker that the point is on, in
@@ -598,7 +615,7 @@ class TargetOutline:
 
     points_half_sides: Array
     edge_normal_to_white_in_drawing: Array
-    line_index_per_point: NDArray[np.intp]
+    printed_line_index_per_point: NDArray[np.intp]
     printed_line_position_sigma_half_sides: Array
     adjacent_cell_width_half_sides: Array
     is_on_small_marker: NDArray[np.bool_]
@@ -622,11 +639,11 @@ def make_outline(
     with the small one in it. Edges of the large marker that may be hidden by the small one are
     omitted. The tolerances are standard deviations of the position of a printed edge, in cells of
     the large and of the small marker."""
-    hidden = _OCCLUSION_REACH_FROM_CENTRE_SMALL_HALF_SIDES * drawing.small_to_large_side_ratio
+    hidden = _OMIT_LARGE_MARKER_EDGES_WITHIN_SMALL_HALF_SIDES * drawing.small_to_large_side_ratio
     edges = [
         edge
         for edge in _iterate_cell_edges(
-            drawing.cell_whiteness, 1.0, _POINTS_PER_LARGE_MARKER_CELL_SIDE
+            drawing.cell_whiteness, 1.0, _OUTLINE_POINTS_PER_LARGE_MARKER_CELL_SIDE
         )
         if np.abs(edge.points_half_sides).max(axis=1).min() > hidden
     ]
@@ -635,7 +652,7 @@ def make_outline(
         edges += _iterate_cell_edges(
             drawing.small_marker_cell_whiteness,
             drawing.small_to_large_side_ratio,
-            _POINTS_PER_SMALL_MARKER_CELL_SIDE,
+            _OUTLINE_POINTS_PER_SMALL_MARKER_CELL_SIDE,
         )
     at, normals, names, cells = zip(*edges, strict=True)
     numbers = {name: k for k, name in enumerate(names)}
@@ -645,7 +662,7 @@ def make_outline(
     return TargetOutline(
         points_half_sides=np.concatenate(at),
         edge_normal_to_white_in_drawing=np.repeat(normals, points_per_edge, axis=0),
-        line_index_per_point=np.repeat([numbers[name] for name in names], points_per_edge),
+        printed_line_index_per_point=np.repeat([numbers[name] for name in names], points_per_edge),
         printed_line_position_sigma_half_sides=np.where(
             small, small_print_tolerance_cells, large_print_tolerance_cells
         )
@@ -659,15 +676,17 @@ def make_outline(
 def make_drawing_texture(drawing: MarkerDrawing) -> DrawingTexture:
     """Return an image of the target on its white paper, rendered from `drawing`, the drawing of the
     large marker with the small one in it. The image is square and extends at least 1.25 half sides
-    of the large marker (`PAPER_REACH_FROM_CENTRE_LARGE_HALF_SIDES`) from the target's centre in x
+    of the large marker (`ASSUMED_PAPER_HALF_WIDTH_LARGE_HALF_SIDES`) from the target's centre in x
     and y."""
     axis = make_sampling_grid(
-        _TEXTURE_SIZE_PX, PAPER_REACH_FROM_CENTRE_LARGE_HALF_SIDES
+        _DRAWING_TEXTURE_SIZE_PX, ASSUMED_PAPER_HALF_WIDTH_LARGE_HALF_SIDES
     ).node_positions_half_sides
-    wide = render_cells(drawing, axis, PAPER_REACH_FROM_CENTRE_LARGE_HALF_SIDES / _TEXTURE_SIZE_PX)
-    more = (len(wide) - _TEXTURE_SIZE_PX) // 2
-    scale = _TEXTURE_SIZE_PX / (2.0 * PAPER_REACH_FROM_CENTRE_LARGE_HALF_SIDES)
-    first = PAPER_REACH_FROM_CENTRE_LARGE_HALF_SIDES * scale - 0.5 + more
+    wide = render_cells(
+        drawing, axis, ASSUMED_PAPER_HALF_WIDTH_LARGE_HALF_SIDES / _DRAWING_TEXTURE_SIZE_PX
+    )
+    more = (len(wide) - _DRAWING_TEXTURE_SIZE_PX) // 2
+    scale = _DRAWING_TEXTURE_SIZE_PX / (2.0 * ASSUMED_PAPER_HALF_WIDTH_LARGE_HALF_SIDES)
+    first = ASSUMED_PAPER_HALF_WIDTH_LARGE_HALF_SIDES * scale - 0.5 + more
     T = np.array([[scale, 0.0, first], [0.0, scale, first], [0.0, 0.0, 1.0]])
     return DrawingTexture(np.clip(wide, 0.0, 1.0), T)
 
@@ -701,8 +720,8 @@ def _iterate_cell_edges(
     and its side is `side_to_large_side_ratio` times that of the large marker."""
     width = 2.0 * side_to_large_side_ratio / len(cell_whiteness)
     s = (
-        _EDGE_END_MARGIN_CELLS
-        + (1.0 - 2.0 * _EDGE_END_MARGIN_CELLS)
+        _OUTLINE_POINT_MARGIN_AT_EDGE_ENDS_CELLS
+        + (1.0 - 2.0 * _OUTLINE_POINT_MARGIN_AT_EDGE_ENDS_CELLS)
         * (np.arange(points_per_edge) + 0.5)
         / points_per_edge
     )
@@ -732,30 +751,34 @@ _PROFILE_HALF_LENGTH_PER_ITERATION_PX = (14.0, 10.0, 8.0, 8.0, 8.0, 8.0)
 _MAX_PROFILE_HALF_LENGTH_CELLS, _MIN_PROFILE_HALF_LENGTH_PX = 0.4, 3.0
 # A step below the first limit ends the fit. If the last step exceeds the second limit, the fit has
 # failed.
-_MAX_CONVERGED_STEP_PX, _MAX_FINAL_STEP_TO_ACCEPT_PX = 0.02, 0.5
+_MAX_STEP_TO_COUNT_AS_CONVERGED_PX, _MAX_FINAL_STEP_TO_ACCEPT_FIT_PX = 0.02, 0.5
 # Minimum contrast of an edge: in grey levels, and as a fraction of the median contrast.
-_MIN_EDGE_CONTRAST_GREY, _MIN_EDGE_TO_MEDIAN_CONTRAST_RATIO = 8.0, 0.35
+_MIN_CONTRAST_TO_COUNT_AS_EDGE_GREY, _MIN_EDGE_TO_MEDIAN_CONTRAST_RATIO = 8.0, 0.35
 _MIN_EDGE_POINTS_TO_FIT = 24
 _TUKEY_CUTOFF_SIGMAS, _MIN_TUKEY_SCALE_PX = 3.5, 0.15
 # Robust weights make the squared residuals smaller; this factor compensates for that.
 _TUKEY_VARIANCE_CORRECTION_FACTOR = 1.3
 # Error of a whole line, due to the lens and the illumination.
-_COMMON_OFFSET_PER_LINE_SIGMA_PX = 0.02
+_SYSTEMATIC_LINE_OFFSET_SIGMA_PX = 0.02
 # Standard deviations of the predicted pose.
-_TILT_PRIOR_SIGMA_RAD, _ROTATION_PRIOR_SIGMA_RAD, _TRANSLATION_PRIOR_SIGMA_HALF_SIDES = (
+(
+    _TILT_PRIOR_SIGMA_RAD,
+    _ROTATION_ABOUT_OPTICAL_AXIS_PRIOR_SIGMA_RAD,
+    _TRANSLATION_PRIOR_SIGMA_HALF_SIDES,
+) = (
     math.radians(2.0),
     math.radians(20.0),
     1.0,
 )
-_EDGE_SHIFT_PRIOR_SIGMA_PX = 0.15  # standard deviation of the growth of white over black
+_BLOOMING_EDGE_SHIFT_PRIOR_SIGMA_PX = 0.15  # standard deviation of the growth of white over black
 _POSE_PRIOR_INFORMATION_DIAGONAL: Array = (
     np.array(
         [
             _TILT_PRIOR_SIGMA_RAD,
             _TILT_PRIOR_SIGMA_RAD,
-            _ROTATION_PRIOR_SIGMA_RAD,
+            _ROTATION_ABOUT_OPTICAL_AXIS_PRIOR_SIGMA_RAD,
             *3 * [_TRANSLATION_PRIOR_SIGMA_HALF_SIDES],
-            _EDGE_SHIFT_PRIOR_SIGMA_PX,
+            _BLOOMING_EDGE_SHIFT_PRIOR_SIGMA_PX,
         ]
     )
     ** -2.0
@@ -809,7 +832,7 @@ class PoseFit:
 
 
 @dataclass(frozen=True, eq=False)
-class _EdgePoints:
+class _ProjectedEdgePoints:
     """The edge points of a target outline that are in the image and not hidden by the vehicle, as
     projected from a pose of the target.
 
@@ -840,15 +863,15 @@ class _GaussNewtonStep(NamedTuple):
     Attributes:
         pose_and_edge_shift_change: change (7,) of these unknowns.
         inverse_normal_matrix: inverse (7, 7) of the normal matrix, which includes the prior.
-        point_weight: robust weight (n,) of each edge point, 0 to 1; 0 for outliers and where no
-            edge was found.
-        point_variance_px2: variance of the distance of one edge point from its edge.
+        robust_point_weight: robust weight (n,) of each edge point, 0 to 1; 0 for outliers and where
+            no edge was found.
+        point_residual_variance_px2: variance of the distance of one edge point from its edge.
     """
 
     pose_and_edge_shift_change: Array
     inverse_normal_matrix: Array
-    point_weight: Array
-    point_variance_px2: float
+    robust_point_weight: Array
+    point_residual_variance_px2: float
 
 
 def fit_pose(
@@ -904,10 +927,10 @@ def fit_pose(
         moved_px = float(
             np.abs(edge_points.normal_motion_jacobian_wrt_pose_and_shift[:, :6] @ step).max()
         )
-        if moved_px < _MAX_CONVERGED_STEP_PX:
+        if moved_px < _MAX_STEP_TO_COUNT_AS_CONVERGED_PX:
             break
     if fit_step is None or not (
-        moved_px <= _MAX_FINAL_STEP_TO_ACCEPT_PX and pose.t_cam_drawing_half_sides[2] > 0.0
+        moved_px <= _MAX_FINAL_STEP_TO_ACCEPT_FIT_PX and pose.t_cam_drawing_half_sides[2] > 0.0
     ):  # also for NaN
         return None
     return _make_pose_fit(pose, fit_step, edge_points, outline)
@@ -942,7 +965,7 @@ def _project_edge_points_in_view(
     image_shape: tuple[int, ...],
     camera: CameraModel,
     hidden_mask_u8: NDArray[np.uint8] | None,
-) -> _EdgePoints:
+) -> _ProjectedEdgePoints:
     h, w = image_shape[:2]
     X = (
         np.column_stack([outline.points_half_sides, np.zeros(len(outline.points_half_sides))])
@@ -992,11 +1015,11 @@ def _project_edge_points_in_view(
             )
             free &= hidden_mask_u8[y_px, x_px] == 0
     J = np.concatenate([turn, move, -np.ones((len(near), 1))], axis=1)
-    return _EdgePoints(at[free], normal[free], J[free], np.abs(px)[free], near[free])
+    return _ProjectedEdgePoints(at[free], normal[free], J[free], np.abs(px)[free], near[free])
 
 
 def _measure_edge_offsets(
-    image: NDArray[np.uint8], edge_points: _EdgePoints, profile_half_lengths_px: Array
+    image: NDArray[np.uint8], edge_points: _ProjectedEdgePoints, profile_half_lengths_px: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return two values for each edge point: the distance (n,), px, of the edge in the image from
     its expected position along the point's normal, positive towards white; and whether an edge was
@@ -1014,12 +1037,15 @@ def _measure_edge_offsets(
         profile_half_lengths_px,
     )[:, 0]
     gradient = np.diff(grey, axis=1).astype(np.float64)
-    u = profile_half_lengths_px[:, None] * GRADIENT_POSITIONS_HALF_LENGTHS.astype(np.float64)
+    u = profile_half_lengths_px[:, None] * GRADIENT_POSITIONS_ALONG_PROFILE_HALF_LENGTHS.astype(
+        np.float64
+    )
     mass = gradient * np.exp(-0.5 * (u / (0.5 * profile_half_lengths_px[:, None])) ** 2)
     total = mass.sum(axis=1)
     contrast = grey[:, -1].astype(np.float64) - grey[:, 0]
     least = max(
-        _MIN_EDGE_CONTRAST_GREY, _MIN_EDGE_TO_MEDIAN_CONTRAST_RATIO * float(np.median(contrast))
+        _MIN_CONTRAST_TO_COUNT_AS_EDGE_GREY,
+        _MIN_EDGE_TO_MEDIAN_CONTRAST_RATIO * float(np.median(contrast)),
     )
     is_edge_found = (contrast > least) & (total > 0.25 * least)
     edge_offset_to_white_px = (mass * u).sum(axis=1) / np.where(is_edge_found, total, 1.0)
@@ -1029,7 +1055,7 @@ def _measure_edge_offsets(
 
 
 def _solve_gauss_newton_step(
-    edge_points: _EdgePoints,
+    edge_points: _ProjectedEdgePoints,
     edge_offset_to_white_px: Array,
     is_edge_found: NDArray[np.bool_],
     pose_and_edge_shift_change_from_start: Array,
@@ -1069,14 +1095,17 @@ def _solve_gauss_newton_step(
 
 
 def _make_pose_fit(
-    pose: RigidPose, fit_step: _GaussNewtonStep, edge_points: _EdgePoints, outline: TargetOutline
+    pose: RigidPose,
+    fit_step: _GaussNewtonStep,
+    edge_points: _ProjectedEdgePoints,
+    outline: TargetOutline,
 ) -> PoseFit:
     J, (_, inverse, w, variance) = edge_points.normal_motion_jacobian_wrt_pose_and_shift, fit_step
-    line = outline.line_index_per_point[edge_points.outline_point_index]
+    line = outline.printed_line_index_per_point[edge_points.outline_point_index]
     common_px = np.hypot(
         outline.printed_line_position_sigma_half_sides[edge_points.outline_point_index]
         * edge_points.px_per_half_side,
-        _COMMON_OFFSET_PER_LINE_SIGMA_PX,
+        _SYSTEMATIC_LINE_OFFSET_SIGMA_PX,
     )
     by_line = np.zeros((int(line.max()) + 1, J.shape[1]))
     np.add.at(by_line, line, J * (w * common_px)[:, None])

@@ -29,7 +29,7 @@ from perchctl.vision.markers.blurred import (
     find_expected_blurred_marker,
 )
 from perchctl.vision.markers.corners import (
-    CORNER_SIGMA_FROM_OTHER_MARKER_PX,
+    SIGMA_OF_CORNERS_DERIVED_FROM_OTHER_MARKER_PX,
     RefinedCorners,
     add_missing_marker_corners,
     is_inside_image,
@@ -38,7 +38,7 @@ from perchctl.vision.markers.corners import (
     side_lengths_px,
 )
 from perchctl.vision.markers.cut import (
-    MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S,
+    MAX_TARGET_MEASUREMENT_AGE_TO_TRY_TRUNCATED_FIT_S,
     can_complete_marker_be_in_view,
     fit_truncated_markers,
     is_target_possibly_truncated,
@@ -52,20 +52,20 @@ from perchctl.vision.markers.detector import (
 )
 from perchctl.vision.markers.edge_fit import refine_corners_by_lines
 from perchctl.vision.markers.partial import (
-    IMAGE_BORDER_MARGIN_PX,
+    MIN_EDGE_DISTANCE_FROM_IMAGE_BORDER_PX,
     IdentificationEvidence,
     fit_partly_visible_marker,
     is_fully_visible,
 )
 from perchctl.vision.markers.pattern import (
-    MIN_MARKER_SIDE_PX,
+    MIN_MARKER_SIDE_TO_IDENTIFY_PX,
     MarkerPattern,
     has_matching_cells,
     has_mostly_matching_cells,
     is_correlated_with_pattern,
 )
 from perchctl.vision.markers.search import (
-    FoundMarkers,
+    MarkerSearchResult,
     SearchMode,
     search_for_markers,
     search_half_size_image,
@@ -82,9 +82,9 @@ from perchctl.vision.types import (
     PictureKind,
 )
 
-_MIN_MARKER_SIDE_FOUND_BY_SEARCH_PX = 13.0  # The search does not find smaller markers.
+_MIN_MISSING_MARKER_SIDE_TO_RUN_SEARCH_PX = 13.0  # The search does not find smaller markers.
 # A measured edge shift stays valid for this number of frames because the light changes slowly.
-_MAX_EDGE_SHIFT_AGE_FRAMES = 5
+_MAX_FRAMES_TO_REUSE_BLOOMING_EDGE_SHIFT = 5
 _FoundCorners = dict[MarkerName, RefinedCorners]
 
 
@@ -106,13 +106,13 @@ class DetectionPrior:
             fits in this frame start with a small blur; if it is odd, with a large one. None to try
             both.
         was_target_seen_recently: True if a marker was found at most
-            `MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S` before this frame; always False if edge fits
-            are disabled.
-        was_target_truncated: True if `was_target_seen_recently` is True and the image border
-            truncated every marker that was detected last.
-        previous_edge_shift: how far white has grown over black (blooming), in pixels, with its
-            standard deviation, as measured in a recent frame; None if it must be measured in this
-            frame.
+            `MAX_TARGET_MEASUREMENT_AGE_TO_TRY_TRUNCATED_FIT_S` before this frame; always False if
+            edge fits are disabled.
+        was_target_truncated_when_last_seen: True if `was_target_seen_recently` is True and the
+            image border truncated every marker that was detected last.
+        recently_measured_edge_shift: how far white has grown over black (blooming), in pixels, with
+            its standard deviation, as measured in a recent frame; None if it must be measured in
+            this frame.
         measure_marker_to_own_target_distance_m: function that returns a marker's horizontal
             distance, m, from the position of this vehicle's own target. If several targets are in
             view and no corners are expected, the target with the smallest distance is selected.
@@ -124,8 +124,8 @@ class DetectionPrior:
     search_mode: SearchMode
     blurred_fit_attempt_index: int | None
     was_target_seen_recently: bool
-    was_target_truncated: bool
-    previous_edge_shift: EdgeShiftEstimate | None
+    was_target_truncated_when_last_seen: bool
+    recently_measured_edge_shift: EdgeShiftEstimate | None
     measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None
 
 
@@ -136,7 +136,7 @@ class CornerResults:
     detector, which is empty if no search has run."""
 
     corners: dict[MarkerName, RefinedCorners] = field(default_factory=dict)
-    search_result: FoundMarkers = field(default_factory=FoundMarkers)
+    search_result: MarkerSearchResult = field(default_factory=MarkerSearchResult)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,11 +145,11 @@ class CornerMethod:
 
     Attributes:
         name: heading in ``docs/corners.md``.
-        requirements_text: what the target must look like in the image, and what must be known about
-            it beforehand, for the method to succeed. This text and the next two are only shown to
-            readers of ``docs/corners.md``; no code evaluates them.
-        cost_text: typical time for an image of 640x480 on one core.
-        run_condition_text: description of the cases in which `should_run` returns True.
+        docs_prerequisites: what the target must look like in the image, and what must be known
+            about it beforehand, for the method to succeed. This text and the next two are only
+            shown to readers of ``docs/corners.md``; no code evaluates them.
+        docs_typical_time: typical time for an image of 640x480 on one core.
+        docs_run_condition: description of the cases in which `should_run` returns True.
         should_run: function that returns True if the method should be tried on the image, given the
             prior and the results so far.
         find: function that runs the method and returns the new results, which replace the previous
@@ -157,9 +157,9 @@ class CornerMethod:
     """
 
     name: str
-    requirements_text: str
-    cost_text: str
-    run_condition_text: str
+    docs_prerequisites: str
+    docs_typical_time: str
+    docs_run_condition: str
     should_run: Callable[[DetectorInput, DetectionPrior, CornerResults], bool]
     find: Callable[[DetectorInput, DetectionPrior, CornerResults], CornerResults]
 
@@ -180,7 +180,9 @@ def _fit_edges(
     return replace(
         earlier_results,
         corners=refine_expected_markers(
-            detector_input, prior.expected_corners_both_markers_px, prior.previous_edge_shift
+            detector_input,
+            prior.expected_corners_both_markers_px,
+            prior.recently_measured_edge_shift,
         ),
     )
 
@@ -219,7 +221,7 @@ def _fit_visible_part(
         detector_input,
         prior.expected_corners_both_markers_px,
         earlier_results.corners,
-        prior.previous_edge_shift,
+        prior.recently_measured_edge_shift,
     )
     return replace(earlier_results, corners=corners)
 
@@ -267,7 +269,7 @@ def _should_search(
     if prior.search_mode in ("whole_blurred", "expected_fits"):
         return False
     if not earlier_results.corners and (
-        not prior.was_target_truncated
+        not prior.was_target_truncated_when_last_seen
         or can_complete_marker_be_in_view(
             prior.expected_corners_both_markers_px, detector_input.image.shape
         )
@@ -313,57 +315,57 @@ def _run_blurred_search(
 CORNER_METHODS: tuple[CornerMethod, ...] = (
     CornerMethod(
         name="Edge fit",
-        requirements_text="an expected, whole marker with straight sides and cells of at least "
+        docs_prerequisites="an expected, whole marker with straight sides and cells of at least "
         "2.5 px",
-        cost_text="0.7 ms",
-        run_condition_text="the target is expected; after the target was lost, in three of four "
+        docs_typical_time="0.7 ms",
+        docs_run_condition="the target is expected; after the target was lost, in three of four "
         "images",
         should_run=_should_fit_edges,
         find=_fit_edges,
     ),
     CornerMethod(
         name="Half-size search",
-        requirements_text="both markers expected, those in view with sides above 60 px",
-        cost_text="5 ms, including the measurement of the markers found",
-        run_condition_text="the edge fit was tried and found no marker",
+        docs_prerequisites="both markers expected, those in view with sides above 60 px",
+        docs_typical_time="5 ms, including the measurement of the markers found",
+        docs_run_condition="the edge fit was tried and found no marker",
         should_run=_should_search_half_size_image,
         find=_search_half_size_image,
     ),
     CornerMethod(
         name="Partial-view fit",
-        requirements_text="an expected marker with cells of at least 4 px, of which at least "
+        docs_prerequisites="an expected marker with cells of at least 4 px, of which at least "
         "60 % of the cells and four edges are visible",
-        cost_text="3 ms for each marker",
-        run_condition_text="the edge fit was tried, and a marker is missing; "
+        docs_typical_time="3 ms for each marker",
+        docs_run_condition="the edge fit was tried, and a marker is missing; "
         "not if the half-size search found one",
         should_run=_should_fit_visible_part,
         find=_fit_visible_part,
     ),
     CornerMethod(
         name="Photometric fit",
-        requirements_text="a whole marker with sides of at least 7 px, whose corners are known to "
+        docs_prerequisites="a whole marker with sides of at least 7 px, whose corners are known to "
         "within 0.3 times a side",
-        cost_text="1.3 ms for each marker",
-        run_condition_text="the edge fit was tried, and no marker's edges suffice: its cells are "
+        docs_typical_time="1.3 ms for each marker",
+        docs_run_condition="the edge fit was tried, and no marker's edges suffice: its cells are "
         "smaller than 6 px or than six times the blur; not if the half-size search found one",
         should_run=_needs_photometric_fit,
         find=_run_photometric_fit,
     ),
     CornerMethod(
         name="Cut-view fit",
-        requirements_text="a measurement at most 0.5 s old, and small-marker cells of at least "
+        docs_prerequisites="a measurement at most 0.5 s old, and small-marker cells of at least "
         "8 px",
-        cost_text="7 ms",
-        run_condition_text="nothing was found, and each expected marker may be cut off by the edge "
+        docs_typical_time="7 ms",
+        docs_run_condition="nothing was found, and each expected marker may be cut off by the edge "
         "of the image or hidden",
         should_run=_can_target_be_truncated,
         find=_fit_truncated_target,
     ),
     CornerMethod(
         name="Search",
-        requirements_text="a marker whose bits can be read",
-        cost_text="4 to 9 ms, including the measurement of the markers found",
-        run_condition_text="nothing was found, unless the target was cut off before and still is; "
+        docs_prerequisites="a marker whose bits can be read",
+        docs_typical_time="4 to 9 ms, including the measurement of the markers found",
+        docs_run_condition="nothing was found, unless the target was cut off before and still is; "
         "or an expected marker with sides above 13 px is missing; after the target was "
         "lost, in three of four images",
         should_run=_should_search,
@@ -371,9 +373,9 @@ CORNER_METHODS: tuple[CornerMethod, ...] = (
     ),
     CornerMethod(
         name="Blurred search",
-        requirements_text="a whole marker with sides of at least 7 px that resembles its drawing",
-        cost_text="5 to 10 ms",
-        run_condition_text="nothing was found; after the target was lost, in one of four images",
+        docs_prerequisites="a whole marker with sides of at least 7 px that resembles its drawing",
+        docs_typical_time="5 to 10 ms",
+        docs_run_condition="nothing was found; after the target was lost, in one of four images",
         should_run=_can_target_be_blurred,
         find=_run_blurred_search,
     ),
@@ -468,15 +470,15 @@ def make_detection_prior(
     last = {} if previous is None else {d.marker: d.corners_px for d in previous.markers}
     was_recent = (
         previous is not None
-        and 0.0 < frame.t_s - previous.t_s <= MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S
+        and 0.0 < frame.t_s - previous.t_s <= MAX_TARGET_MEASUREMENT_AGE_TO_TRY_TRUNCATED_FIT_S
     )
     was_recent = was_recent and setup.is_line_fit_enabled and bool(last)
-    previous_edge_shift = None if previous is None else previous.edge_shift
-    if previous_edge_shift is not None:
-        age = previous_edge_shift.age_frames + 1
-        previous_edge_shift = (
-            replace(previous_edge_shift, age_frames=age)
-            if age < _MAX_EDGE_SHIFT_AGE_FRAMES
+    recently_measured_edge_shift = None if previous is None else previous.edge_shift
+    if recently_measured_edge_shift is not None:
+        age = recently_measured_edge_shift.age_frames + 1
+        recently_measured_edge_shift = (
+            replace(recently_measured_edge_shift, age_frames=age)
+            if age < _MAX_FRAMES_TO_REUSE_BLOOMING_EDGE_SHIFT
             else None
         )
     return DetectionPrior(
@@ -487,9 +489,9 @@ def make_detection_prior(
         search_mode=search_mode,
         blurred_fit_attempt_index=blurred_fit_attempt_index,
         was_target_seen_recently=was_recent,
-        was_target_truncated=was_recent
+        was_target_truncated_when_last_seen=was_recent
         and not can_complete_marker_be_in_view(last, frame.image.shape),
-        previous_edge_shift=previous_edge_shift,
+        recently_measured_edge_shift=recently_measured_edge_shift,
         measure_marker_to_own_target_distance_m=measure_marker_to_own_target_distance_m,
     )
 
@@ -558,13 +560,15 @@ def _is_marker_missing(
     return any(
         name not in found_corners
         and is_inside_image(corners, detector_input.image.shape)
-        and side_lengths_px(corners).min() > _MIN_MARKER_SIDE_FOUND_BY_SEARCH_PX
+        and side_lengths_px(corners).min() > _MIN_MISSING_MARKER_SIDE_TO_RUN_SEARCH_PX
         and not is_any_marker_part_hidden(detector_input.hidden_mask, corners)
         for name, corners in expected_corners_px.items()
     )
 
 
-def _refine_found_markers(detector_input: DetectorInput, found: FoundMarkers) -> _FoundCorners:
+def _refine_found_markers(
+    detector_input: DetectorInput, found: MarkerSearchResult
+) -> _FoundCorners:
     """Refine the raw corners of the markers that a search found, and return the markers that could
     be measured. If line fits are disabled, subpixel refinement is the only method. Otherwise, these
     methods are used in turn:
@@ -612,7 +616,7 @@ def _refine_found_markers(detector_input: DetectorInput, found: FoundMarkers) ->
         if partly is not None:
             fitted[name] = partly
         elif not is_inside_image(
-            r.corners_px, image.shape, IMAGE_BORDER_MARGIN_PX
+            r.corners_px, image.shape, MIN_EDGE_DISTANCE_FROM_IMAGE_BORDER_PX
         ) or is_any_marker_part_hidden(detector_input.hidden_mask, r.corners_px, 1.0):
             del fitted[name]
     return refine_photometrically(detector_input, fitted, is_from_search=True)
@@ -645,7 +649,8 @@ def _make_detection(
 
 
 _MEAN_OF_FOUR_WEIGHTS: Array = np.full(4, 0.25)
-_MAX_MARKER_FLOW_AGE_S = 0.25  # older image motion is useless for predicting positions
+# Older image motion is useless for predicting positions.
+_MAX_DETECTION_INTERVAL_TO_USE_MARKER_FLOW_S = 0.25
 
 
 def extrapolate_corners(previous: Detections | None, t_s: float) -> dict[MarkerName, Array]:
@@ -655,7 +660,7 @@ def extrapolate_corners(previous: Detections | None, t_s: float) -> dict[MarkerN
     if previous is None:
         return {}
     gap_s = t_s - previous.t_s
-    moves = 0.0 < gap_s <= _MAX_MARKER_FLOW_AGE_S
+    moves = 0.0 < gap_s <= _MAX_DETECTION_INTERVAL_TO_USE_MARKER_FLOW_S
     corners: dict[MarkerName, Array] = {}
     for d in previous.markers:
         flow = previous.corner_flow_pxps.get(d.marker)
@@ -667,8 +672,12 @@ def add_marker_flow(current: Detections, previous: Detections | None) -> Detecti
     """Return `current` with the image velocity, px/s, of its markers' corners since the `previous`
     detections, by finite differences. If only one marker was detected both times, the other one
     gets the mean velocity of that marker's corners. `current` is returned unchanged if no marker
-    was detected both times, or if `previous` is None or more than `_MAX_MARKER_FLOW_AGE_S` old."""
-    if previous is None or not 0.0 < current.t_s - previous.t_s <= _MAX_MARKER_FLOW_AGE_S:
+    was detected both times, or if `previous` is None or more than
+    `_MAX_DETECTION_INTERVAL_TO_USE_MARKER_FLOW_S` old."""
+    if (
+        previous is None
+        or not 0.0 < current.t_s - previous.t_s <= _MAX_DETECTION_INTERVAL_TO_USE_MARKER_FLOW_S
+    ):
         return current
     flow: dict[MarkerName, Array] = {}
     for name in MARKERS:
@@ -688,11 +697,14 @@ def add_marker_flow(current: Detections, previous: Detections | None) -> Detecti
 _MIN_CELL_FOR_ACCURATE_LINE_FIT_PX = 6.0
 # For this accuracy, a cell must also be wider than this multiple of the blur's standard deviation.
 _MIN_CELL_TO_BLUR_RATIO_FOR_ACCURATE_LINE_FIT = 6.0
-_MAX_PHOTOMETRIC_FIT_MOTION_FROM_START_SIDES = 0.3
+_MAX_CORNER_MOTION_IN_PHOTOMETRIC_FIT_SIDES = 0.3
 # A marker that is located from the other marker may have a larger standard deviation.
-_MAX_SINGLE_MARKER_CORNER_SIGMA_SIDES, _MAX_CORNER_SIGMA_IF_OTHER_MARKER_FOUND_SIDES = 0.06, 0.12
-_DEFAULT_INITIAL_BLUR_SIGMA_PX = 1.5
-_SAMPLING_BLUR_SIGMA_PX = 0.37
+_MAX_CORNER_SIGMA_TO_ACCEPT_ONLY_MARKER_SIDES, _MAX_CORNER_SIGMA_TO_ACCEPT_SECOND_MARKER_SIDES = (
+    0.06,
+    0.12,
+)
+_DEFAULT_PHOTOMETRIC_INITIAL_BLUR_SIGMA_PX = 1.5
+_BLUR_SIGMA_DUE_TO_PIXEL_SAMPLING_PX = 0.37
 """Standard deviation, px, that pixels and interpolation add to the measured blur of a marker's
 sides, but not to the blur of its drawing."""
 _OTHER_MARKER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
@@ -738,16 +750,16 @@ def refine_photometrically(
             continue
         is_single = _OTHER_MARKER[name] not in better
         max_corner_sigma_sides = (
-            _MAX_SINGLE_MARKER_CORNER_SIGMA_SIDES
+            _MAX_CORNER_SIGMA_TO_ACCEPT_ONLY_MARKER_SIDES
             if is_single
-            else _MAX_CORNER_SIGMA_IF_OTHER_MARKER_FOUND_SIDES
+            else _MAX_CORNER_SIGMA_TO_ACCEPT_SECOND_MARKER_SIDES
         )
         blur_px = _photometric_initial_blur_sigma_px(better.get(name))
         exact = align_marker(
             detector_input,
             name,
             start,
-            _MAX_PHOTOMETRIC_FIT_MOTION_FROM_START_SIDES,
+            _MAX_CORNER_MOTION_IN_PHOTOMETRIC_FIT_SIDES,
             blur_px,
             max_corner_sigma_sides,
             is_single,
@@ -757,7 +769,9 @@ def refine_photometrically(
         elif is_single and is_from_search:
             better.pop(name, None)
         elif name not in better and is_correlated_with_pattern(image, start, patterns[name]):
-            better[name] = RefinedCorners(start, CORNER_SIGMA_FROM_OTHER_MARKER_PX, False)
+            better[name] = RefinedCorners(
+                start, SIGMA_OF_CORNERS_DERIVED_FROM_OTHER_MARKER_PX, False
+            )
     return better
 
 
@@ -765,16 +779,21 @@ def _photometric_initial_blur_sigma_px(corners: RefinedCorners | None) -> float:
     """Return the standard deviation of the blur, px, at which a photometric fit starts. If lines
     were fitted to the sides in `corners`, it is the blur of the blurriest side without the blur due
     to sampling (its variance is subtracted). Otherwise, or if `corners` is None, it is
-    `_DEFAULT_INITIAL_BLUR_SIGMA_PX`, which is also the upper limit."""
+    `_DEFAULT_PHOTOMETRIC_INITIAL_BLUR_SIGMA_PX`, which is also the upper limit."""
     if (
         corners is None
         or not corners.are_corners_fitted
         or corners.blurriest_side_blur_sigma_px <= 0.0
     ):
-        return _DEFAULT_INITIAL_BLUR_SIGMA_PX
+        return _DEFAULT_PHOTOMETRIC_INITIAL_BLUR_SIGMA_PX
     return min(
-        math.sqrt(max(corners.blurriest_side_blur_sigma_px**2 - _SAMPLING_BLUR_SIGMA_PX**2, 0.0)),
-        _DEFAULT_INITIAL_BLUR_SIGMA_PX,
+        math.sqrt(
+            max(
+                corners.blurriest_side_blur_sigma_px**2 - _BLUR_SIGMA_DUE_TO_PIXEL_SAMPLING_PX**2,
+                0.0,
+            )
+        ),
+        _DEFAULT_PHOTOMETRIC_INITIAL_BLUR_SIGMA_PX,
     )
 
 
@@ -798,8 +817,8 @@ def _photometric_start_corners_px(
 # --- Markers at their expected positions, which are only verified, not searched for ---
 
 
-_MIN_CELL_FOR_LINE_FIT_PX = 2.5
-_MAX_DERIVED_SMALL_MARKER_CORNER_ERROR_SIDES = 0.12
+_MIN_CELL_SIZE_TO_TRY_LINE_FIT_PX = 2.5
+_MAX_SMALL_CORNER_MISMATCH_TO_ACCEPT_LARGE_SIDES = 0.12
 
 
 def fit_side_lines(
@@ -847,9 +866,11 @@ def refine_expected_markers(
         name: expected_corners_px[name]
         for name in MARKERS
         if name in expected_corners_px
-        and is_inside_image(expected_corners_px[name], image.shape, IMAGE_BORDER_MARGIN_PX)
+        and is_inside_image(
+            expected_corners_px[name], image.shape, MIN_EDGE_DISTANCE_FROM_IMAGE_BORDER_PX
+        )
         and side_lengths_px(expected_corners_px[name]).min()
-        > _MIN_CELL_FOR_LINE_FIT_PX * patterns[name].cells_along_border.cells_per_side
+        > _MIN_CELL_SIZE_TO_TRY_LINE_FIT_PX * patterns[name].cells_along_border.cells_per_side
     }
     return {
         name: found
@@ -893,11 +914,11 @@ def add_partly_visible_markers(
         small_px = detector_input.derive_corners_from_other_marker_px(
             found_corners["large"].corners_px, "small"
         )
-        if mean_side_px(small_px) > MIN_MARKER_SIDE_PX and is_correlated_with_pattern(
+        if mean_side_px(small_px) > MIN_MARKER_SIDE_TO_IDENTIFY_PX and is_correlated_with_pattern(
             detector_input.image, small_px, detector_input.setup.patterns["small"]
         ):
             found_corners["small"] = RefinedCorners(
-                small_px, CORNER_SIGMA_FROM_OTHER_MARKER_PX, False
+                small_px, SIGMA_OF_CORNERS_DERIVED_FROM_OTHER_MARKER_PX, False
             )
     return found_corners
 
@@ -916,10 +937,10 @@ def find_large_marker_around_small(
         centre = detector_input.derive_corners_from_other_marker_px(large.corners_px, "small")
         off_px = float(np.abs(centre - small.corners_px).max())
         return off_px <= max(
-            _MAX_DERIVED_SMALL_MARKER_CORNER_ERROR_SIDES * mean_side_px(small.corners_px), 1.0
+            _MAX_SMALL_CORNER_MISMATCH_TO_ACCEPT_LARGE_SIDES * mean_side_px(small.corners_px), 1.0
         )
 
-    if is_inside_image(start, image.shape, IMAGE_BORDER_MARGIN_PX):
+    if is_inside_image(start, image.shape, MIN_EDGE_DISTANCE_FROM_IMAGE_BORDER_PX):
         # The small marker only yields an approximate position, so the fit is repeated from its
         # first result.
         found = fit_side_lines(detector_input, {"large": start}).get("large")
@@ -937,7 +958,7 @@ def find_large_marker_around_small(
 # --- Mean of the markers in two fields, at the time halfway between the fields ---
 
 
-_MAX_MOTION_BETWEEN_FIELDS_SIDES = 1.5  # corresponds to 1.9 m/s for the small marker
+_MAX_MARKER_MOTION_TO_AVERAGE_FIELDS_SIDES = 1.5  # corresponds to 1.9 m/s for the small marker
 
 
 def average_field_detections(first: Detections, second: Detections) -> Detections:
@@ -952,9 +973,9 @@ def average_field_detections(first: Detections, second: Detections) -> Detection
         if one is None or other is None:
             continue
         offset_px = one.corners_px.mean(axis=0) - other.corners_px.mean(axis=0)
-        if float(np.linalg.norm(offset_px)) < _MAX_MOTION_BETWEEN_FIELDS_SIDES * mean_side_px(
-            one.corners_px
-        ):
+        if float(
+            np.linalg.norm(offset_px)
+        ) < _MAX_MARKER_MOTION_TO_AVERAGE_FIELDS_SIDES * mean_side_px(one.corners_px):
             averaged[name] = _average_detections(one, other)
     if not averaged:
         alone = first if first.markers else second

@@ -30,19 +30,19 @@ MIRRORED_MARKER_ID = 1
 """Index of the marker's mirror image in its dictionary."""
 # The error of an edge is small because the errors of its hundreds of printed dots average out.
 _PRINTED_EDGE_POSITION_SIGMA_M = 1e-6
-_MIN_MARKER_PERIMETER_PX = 19.2  # OpenCV's default, 0.03 times the image size, for 640 px
-_QUAD_DETECTOR_MIN_PERIMETER_RATE = 0.05
-_QUAD_DETECTOR_POLYGON_ACCURACY_RATE = 0.1
+_MIN_MARKER_PERIMETER_TO_DETECT_PX = 19.2  # OpenCV's default, 0.03 times the image size, for 640 px
+_QUAD_DETECTOR_MIN_MARKER_PERIMETER_RATE = 0.05
+_QUAD_DETECTOR_POLYGONAL_APPROX_ACCURACY_RATE = 0.1
 
 
 ThresholdWindowRange = tuple[int, int]
 """Smallest and largest window of the adaptive threshold, px; OpenCV tries windows in steps of
 10."""
-OPENCV_DEFAULT_THRESHOLD_WINDOWS_PX: ThresholdWindowRange = (3, 23)
+OPENCV_DEFAULT_THRESHOLD_WINDOW_RANGE_PX: ThresholdWindowRange = (3, 23)
 """OpenCV's default windows."""
 # A single window is sufficient if both markers were seen in the previous frame.
-QUICK_THRESHOLD_WINDOWS_PX: ThresholdWindowRange = (13, 13)
-_QUAD_DETECTOR_THRESHOLD_WINDOWS_PX: ThresholdWindowRange = (15, 35)
+QUICK_SEARCH_THRESHOLD_WINDOW_RANGE_PX: ThresholdWindowRange = (13, 13)
+_QUAD_DETECTOR_THRESHOLD_WINDOW_RANGE_PX: ThresholdWindowRange = (15, 35)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +119,7 @@ def make_aruco_detector(
     parameters.minDistanceToBorder = 0
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = threshold_windows_px
-    parameters.minMarkerPerimeterRate = min(1.0, _MIN_MARKER_PERIMETER_PX / max(size_px))
+    parameters.minMarkerPerimeterRate = min(1.0, _MIN_MARKER_PERIMETER_TO_DETECT_PX / max(size_px))
     return cv2.aruco.ArucoDetector(list(setup.large_and_small_aruco_dictionaries), parameters)
 
 
@@ -129,11 +129,11 @@ def make_quad_detector(setup: DetectorSetup) -> Any:
     with blurred markers (`find_blurred_marker`)."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = 0
-    parameters.polygonalApproxAccuracyRate = _QUAD_DETECTOR_POLYGON_ACCURACY_RATE
-    least_px, most_px = _QUAD_DETECTOR_THRESHOLD_WINDOWS_PX
+    parameters.polygonalApproxAccuracyRate = _QUAD_DETECTOR_POLYGONAL_APPROX_ACCURACY_RATE
+    least_px, most_px = _QUAD_DETECTOR_THRESHOLD_WINDOW_RANGE_PX
     parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = least_px, most_px
     parameters.adaptiveThreshWinSizeStep = most_px - least_px
-    parameters.minMarkerPerimeterRate = _QUAD_DETECTOR_MIN_PERIMETER_RATE
+    parameters.minMarkerPerimeterRate = _QUAD_DETECTOR_MIN_MARKER_PERIMETER_RATE
     return cv2.aruco.ArucoDetector(list(setup.large_and_small_aruco_dictionaries), parameters)
 
 
@@ -155,13 +155,14 @@ def _make_aruco_dictionary(bits: NDArray[np.uint8], max_correction_bits: int) ->
 
 
 HiddenMask = NDArray[np.bool_]
-WHITE_BORDER_REACH_FROM_CENTRE_HALF_SIDES = 1.25
+REQUIRED_VISIBLE_HALF_WIDTH_HALF_SIDES = 1.25
 """Distance from a marker's centre, in half sides, within which any object disturbs the measurement
 of the marker's sides."""
-_HIDDEN_MASK_DILATION_ROWS = 7  # A covered row contributes to this number of a field's image rows.
+# A covered row contributes to this number of a field's image rows.
+_FIELD_HIDDEN_MASK_DILATION_ROWS = 7
 # Factor by which the image is reduced, and standard deviation of the fill in the reduced image.
-_FILL_IMAGE_REDUCTION_FACTOR, _FILL_BLUR_SIGMA_REDUCED_IMAGE_PX = 8, 2.0
-_MEAN_GREY_WEIGHT_IN_FILL = 1e-4
+_HIDDEN_PIXEL_FILL_IMAGE_REDUCTION_FACTOR, _HIDDEN_PIXEL_FILL_BLUR_SIGMA_REDUCED_PX = 8, 2.0
+_MEAN_GREY_WEIGHT_IN_HIDDEN_PIXEL_FILL = 1e-4
 
 
 def make_hidden_mask(frame: Frame, static_hidden_mask: HiddenMask | None) -> HiddenMask | None:
@@ -173,7 +174,8 @@ def make_hidden_mask(frame: Frame, static_hidden_mask: HiddenMask | None) -> Hid
         return static_hidden_mask
     return (
         cv2.dilate(
-            static_hidden_mask.astype(np.uint8), np.ones((_HIDDEN_MASK_DILATION_ROWS, 1), np.uint8)
+            static_hidden_mask.astype(np.uint8),
+            np.ones((_FIELD_HIDDEN_MASK_DILATION_ROWS, 1), np.uint8),
         )
         > 0
     )
@@ -184,17 +186,20 @@ def fill_hidden_pixels(image: NDArray[np.uint8], hidden_mask: HiddenMask) -> NDA
     smooth interpolation of their surroundings."""
     h, w = image.shape
     free = (~hidden_mask).astype(np.float32)
-    size = (max(w // _FILL_IMAGE_REDUCTION_FACTOR, 1), max(h // _FILL_IMAGE_REDUCTION_FACTOR, 1))
+    size = (
+        max(w // _HIDDEN_PIXEL_FILL_IMAGE_REDUCTION_FACTOR, 1),
+        max(h // _HIDDEN_PIXEL_FILL_IMAGE_REDUCTION_FACTOR, 1),
+    )
 
     def around(values: NDArray[np.float32]) -> NDArray[np.float32]:
         reduced = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
         return np.asarray(
-            cv2.GaussianBlur(reduced, (0, 0), _FILL_BLUR_SIGMA_REDUCED_IMAGE_PX), np.float32
+            cv2.GaussianBlur(reduced, (0, 0), _HIDDEN_PIXEL_FILL_BLUR_SIGMA_REDUCED_PX), np.float32
         )
 
     mean = cv2.mean(image, (~hidden_mask).astype(np.uint8))[0]
-    grey = (around(image * free) + _MEAN_GREY_WEIGHT_IN_FILL * mean) / (
-        around(free) + _MEAN_GREY_WEIGHT_IN_FILL
+    grey = (around(image * free) + _MEAN_GREY_WEIGHT_IN_HIDDEN_PIXEL_FILL * mean) / (
+        around(free) + _MEAN_GREY_WEIGHT_IN_HIDDEN_PIXEL_FILL
     )
     smooth = cv2.resize(grey, (w, h), interpolation=cv2.INTER_LINEAR)
     return np.where(hidden_mask, np.rint(smooth).astype(np.uint8), image)
@@ -203,7 +208,7 @@ def fill_hidden_pixels(image: NDArray[np.uint8], hidden_mask: HiddenMask) -> NDA
 def is_any_marker_part_hidden(
     hidden_mask: HiddenMask | None,
     corners_px: Array,
-    reach_from_centre_half_sides: float = WHITE_BORDER_REACH_FROM_CENTRE_HALF_SIDES,
+    reach_from_centre_half_sides: float = REQUIRED_VISIBLE_HALF_WIDTH_HALF_SIDES,
 ) -> bool:
     """True if the vehicle hides any pixel of the marker with `corners_px` (4, 2) in the image or of
     its surroundings: of a concentric square whose half side is `reach_from_centre_half_sides` times

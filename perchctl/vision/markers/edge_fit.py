@@ -67,25 +67,29 @@ Floats = NDArray[np.float32]
 
 # Positions of the profiles along a side, from -1 to 1 between the margins at its ends.
 PROFILE_POSITIONS_ALONG_SIDE: Array = np.linspace(-1.0, 1.0, PROFILES_PER_SIDE)
-_SAMPLE_POSITIONS_HALF_LENGTHS: Floats = np.linspace(
+_SAMPLE_POSITIONS_ALONG_PROFILE_HALF_LENGTHS: Floats = np.linspace(
     -1.0, 1.0, GRADIENT_SAMPLES_PER_PROFILE + 1
 ).astype(np.float32)
-_PROFILE_SAMPLING_MATRIX: Floats = np.stack(
-    [np.ones_like(_SAMPLE_POSITIONS_HALF_LENGTHS), _SAMPLE_POSITIONS_HALF_LENGTHS]
+_CENTRE_AND_DIRECTION_TO_PROFILE_SAMPLES: Floats = np.stack(
+    [
+        np.ones_like(_SAMPLE_POSITIONS_ALONG_PROFILE_HALF_LENGTHS),
+        _SAMPLE_POSITIONS_ALONG_PROFILE_HALF_LENGTHS,
+    ]
 )
 # Positions of the gradient samples along a profile.
-GRADIENT_POSITIONS_HALF_LENGTHS: Floats = (
-    _SAMPLE_POSITIONS_HALF_LENGTHS[1:] + _SAMPLE_POSITIONS_HALF_LENGTHS[:-1]
+GRADIENT_POSITIONS_ALONG_PROFILE_HALF_LENGTHS: Floats = (
+    _SAMPLE_POSITIONS_ALONG_PROFILE_HALF_LENGTHS[1:]
+    + _SAMPLE_POSITIONS_ALONG_PROFILE_HALF_LENGTHS[:-1]
 ) * np.float32(0.5)
 # The two matrices evaluate the polynomial through the nodes, and its slope, at the profiles.
-_INTERPOLATION_NODES_ALONG_SIDE: Array = np.array([-1.0, -0.7, 0.0, 0.7, 1.0])
+_LENS_DISTORTION_NODES_ALONG_SIDE: Array = np.array([-1.0, -0.7, 0.0, 0.7, 1.0])
 _INVERSE_VANDERMONDE: Array = np.linalg.inv(
-    _INTERPOLATION_NODES_ALONG_SIDE[:, None] ** np.arange(5.0)
+    _LENS_DISTORTION_NODES_ALONG_SIDE[:, None] ** np.arange(5.0)
 )
-_PROFILE_VALUE_INTERPOLATION_MATRIX: Array = (
+_DISTORTED_NODES_TO_PROFILE_CENTRES: Array = (
     PROFILE_POSITIONS_ALONG_SIDE[:, None] ** np.arange(5)
 ) @ _INVERSE_VANDERMONDE
-_PROFILE_SLOPE_INTERPOLATION_MATRIX: Array = (
+_DISTORTED_NODES_TO_SIDE_TANGENTS: Array = (
     np.arange(1, 5) * PROFILE_POSITIONS_ALONG_SIDE[:, None] ** np.arange(4)
 ) @ _INVERSE_VANDERMONDE[1:]
 
@@ -117,7 +121,7 @@ def make_profile_centres_and_normals(
     `profile_fractions_along_side`. The image of a side through the lens is a smooth curve, so it is
     computed at five points and interpolated."""
     first, last = fractions_along_side[:, :1], fractions_along_side[:, -1:]
-    at = (0.5 * (first + last) + (0.5 * (last - first)) * _INTERPOLATION_NODES_ALONG_SIDE)[
+    at = (0.5 * (first + last) + (0.5 * (last - first)) * _LENS_DISTORTION_NODES_ALONG_SIDE)[
         ..., None
     ]
     points = (
@@ -125,9 +129,9 @@ def make_profile_centres_and_normals(
         + at * (side_ends_normalised - side_starts_normalised)[:, None]
     )
     nodes = distort_to_px(points.reshape(-1, 2), camera).reshape(points.shape)
-    origin = np.matmul(_PROFILE_VALUE_INTERPOLATION_MATRIX, nodes)
+    origin = np.matmul(_DISTORTED_NODES_TO_PROFILE_CENTRES, nodes)
     # With complex numbers x + iy, a rotation by 90 degrees is a single multiplication.
-    tangent = np.matmul(_PROFILE_SLOPE_INTERPOLATION_MATRIX, nodes).view(np.complex128)
+    tangent = np.matmul(_DISTORTED_NODES_TO_SIDE_TANGENTS, nodes).view(np.complex128)
     normal = tangent * (_ROTATE_90_LEFT / np.maximum(np.abs(tangent), 1e-12))
     return origin, normal.view(np.float64)
 
@@ -173,7 +177,7 @@ def sample_profiles(
         out=lines[1, ..., 1],
         casting="same_kind",
     )
-    x, y = (lines.reshape(-1, 2) @ _PROFILE_SAMPLING_MATRIX).reshape(
+    x, y = (lines.reshape(-1, 2) @ _CENTRE_AND_DIRECTION_TO_PROFILE_SAMPLES).reshape(
         2, rows, n * (GRADIENT_SAMPLES_PER_PROFILE + 1)
     )
     profile_greys = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -185,47 +189,49 @@ def sample_profiles(
 # --- Lines fitted to a marker's sides, and their intersections ---
 
 
-MIN_LINE_SIGMA_PX = 0.015
+FITTED_LINE_SIGMA_LOWER_BOUND_PX = 0.015
 """Lower bound of a fitted line's standard deviation, px."""
 
-_MIN_CELL_PX = 1.0  # smaller cells blend into one grey
+_MIN_CELL_SIZE_TO_ACCEPT_LINE_FIT_PX = 1.0  # smaller cells blend into one grey
 _MAX_EDGE_FIT_RMS_RESIDUAL_PX = 0.6
-_MIN_INLIER_FRACTION = 0.5
+_MIN_INLIER_PROFILE_FRACTION_PER_SIDE = 0.5
 # Robust weights reduce the squared residuals and the number of samples; this factor compensates.
 _TUKEY_LINE_VARIANCE_CORRECTION_FACTOR = 1.7
 # Size and range, in units of the blur, of the error that a neighbouring edge one cell away causes.
-_NEIGHBOUR_EDGE_ERROR_TO_BLUR_RATIO, _NEIGHBOUR_EDGE_ERROR_DECAY_BLUR_SIGMAS = 0.6, 2.0
+_NEIGHBOUR_EDGE_ERROR_SIGMA_TO_BLUR_RATIO, _NEIGHBOUR_EDGE_ERROR_DECAY_LENGTH_BLUR_SIGMAS = 0.6, 2.0
 # Profiles are too short for wide edges. The error, px, grows with the cube of the blur.
-_EDGE_ERROR_PER_CUBED_BLUR_PER_PX2 = 0.0022
+_CORNER_SIGMA_PER_BLUR_SIGMA_CUBED_PER_PX2 = 0.0022
 # If white is clipped, edges move by different amounts.
-CORNER_SIGMA_IF_WHITE_CLIPPED_PX = 0.1
+EXTRA_CORNER_SIGMA_IF_WHITE_CLIPPED_PX = 0.1
 # White counts as clipped if more than this fraction of the profiles (or pixels) is clipped.
-MIN_CLIPPED_WHITE_FRACTION = 0.05
+MIN_CLIPPED_FRACTION_TO_COUNT_WHITE_AS_CLIPPED = 0.05
 # A wide edge that is off centre extends beyond its profile.
-_MIN_WIDE_EDGE_BLUR_SIGMA_PX, _MAX_WIDE_EDGE_OFFSET_WITHOUT_REFIT_PX = 2.2, 0.5
+_MIN_BLUR_SIGMA_TO_COUNT_AS_WIDE_EDGE_PX, _MAX_WIDE_EDGE_CORNER_MOTION_WITHOUT_REFIT_PX = 2.2, 0.5
 # Profiles reach at most 7 px to each side. An edge 6 px off the centre extended beyond its profile
 # and moved by up to 0.3 px.
-_MAX_EDGE_OFFSET_WITHOUT_REFIT_PX = 4.0
+_MAX_CORNER_MOTION_WITHOUT_REFIT_PX = 4.0
 # A larger ratio of the two variances shows that the image rows jitter.
-_MIN_VERTICAL_TO_HORIZONTAL_SIDE_VARIANCE_RATIO = 2.0
+_MIN_VERTICAL_TO_HORIZONTAL_SIDE_VARIANCE_FOR_ROW_JITTER = 2.0
 # Vertical and horizontal sides can only be separated if their orientations (0 to 1) vary enough.
 _MIN_SIDE_ORIENTATION_VARIANCE_FOR_ROW_JITTER = 0.05
-_MIN_MEAN_EDGE_CONTRAST_GREY = 6.0  # contrast between the dark and the bright side of an edge
-_MIN_EDGE_SHIFT_SIGMA_PX = 0.01
-_MAX_EDGE_SHIFT_PX = 1.0
-_MAX_EDGE_BLUR_SIGMA_CELLS = 0.45  # with more blur, the two edges of a border merge
-_MIN_PROFILE_WEIGHT_SUM_PER_SIDE = 3.0
-_EDGE_SHIFT_PRIOR_SIGMA_PX = 0.15  # The shift is due to glare and gamma.
-_EDGE_SHIFT_PRIOR_SIGMA_IF_CLIPPED_PX = 0.4  # The shift is due to clipping.
-MIN_CLIPPED_GREY = 248.0
+# Contrast between the dark and the bright side of an edge.
+_MIN_MEAN_EDGE_CONTRAST_TO_ACCEPT_SIDE_GREY = 6.0
+_BLOOMING_EDGE_SHIFT_SIGMA_LOWER_BOUND_PX = 0.01
+_MAX_INNER_EDGE_OFFSET_TO_MEASURE_BLOOMING_PX = 1.0
+# With more blur, the two edges of a border merge.
+_MAX_INNER_EDGE_BLUR_TO_MEASURE_BLOOMING_CELLS = 0.45
+_MIN_PROFILE_WEIGHT_SUM_TO_USE_SIDE = 3.0
+_BLOOMING_EDGE_SHIFT_PRIOR_SIGMA_PX = 0.15  # The shift is due to glare and gamma.
+_BLOOMING_EDGE_SHIFT_PRIOR_SIGMA_IF_CLIPPED_PX = 0.4  # The shift is due to clipping.
+MIN_GREY_TO_COUNT_AS_CLIPPED = 248.0
 """Grey level above which white counts as clipped."""
-_PROFILE_ONES: Array = np.ones(PROFILES_PER_SIDE)
-_PROFILE_ONES_F32: Floats = np.ones(PROFILES_PER_SIDE, dtype=np.float32)
+_ONES_TO_SUM_PROFILES: Array = np.ones(PROFILES_PER_SIDE)
+_ONES_TO_SUM_PROFILES_F32: Floats = np.ones(PROFILES_PER_SIDE, dtype=np.float32)
 _MEAN_OF_FOUR_WEIGHTS: Array = np.full(4, 0.25)
-_ZERO_MEAN_PARABOLA: Array = (
+_ZERO_MEAN_PARABOLA_ALONG_SIDE: Array = (
     PROFILE_POSITIONS_ALONG_SIDE**2 - (PROFILE_POSITIONS_ALONG_SIDE**2).mean()
 )
-_MIN_SIGNIFICANT_BOW_SIGMAS = 3.0
+_MIN_SIDE_BOW_TO_COUNT_AS_SIGNIFICANT_SIGMAS = 3.0
 
 
 def refine_corners_by_lines(
@@ -259,9 +265,9 @@ def refine_corners_by_lines(
             continue
         off_px = float(np.abs(each.corners_px - raw_corners_px[i]).max())
         if off_px > (
-            _MAX_WIDE_EDGE_OFFSET_WITHOUT_REFIT_PX
-            if each.blurriest_side_blur_sigma_px > _MIN_WIDE_EDGE_BLUR_SIGMA_PX
-            else _MAX_EDGE_OFFSET_WITHOUT_REFIT_PX
+            _MAX_WIDE_EDGE_CORNER_MOTION_WITHOUT_REFIT_PX
+            if each.blurriest_side_blur_sigma_px > _MIN_BLUR_SIGMA_TO_COUNT_AS_WIDE_EDGE_PX
+            else _MAX_CORNER_MOTION_WITHOUT_REFIT_PX
         ):
             centred[i] = each.corners_px
     if (centred == raw_corners_px).all():
@@ -287,10 +293,13 @@ def _refine_corners_by_lines_once(
         image, markers, camera, must_measure_inner_edges=known_edge_shift is None
     )
     glaring = (
-        np.count_nonzero(outer_edges.profile_greys[:, :, -1] > MIN_CLIPPED_GREY, axis=1)
+        np.count_nonzero(outer_edges.profile_greys[:, :, -1] > MIN_GREY_TO_COUNT_AS_CLIPPED, axis=1)
         / PROFILES_PER_SIDE
     )
-    is_white_clipped = glaring.reshape(-1, 4) @ _MEAN_OF_FOUR_WEIGHTS > MIN_CLIPPED_WHITE_FRACTION
+    is_white_clipped = (
+        glaring.reshape(-1, 4) @ _MEAN_OF_FOUR_WEIGHTS
+        > MIN_CLIPPED_FRACTION_TO_COUNT_WHITE_AS_CLIPPED
+    )
     if known_edge_shift is not None and is_white_clipped.any():
         # The edge shift due to clipping changes with the light, so it is measured again.
         return _refine_corners_by_lines_once(
@@ -322,7 +331,8 @@ def _refine_corners_by_lines_once(
     # middle.
     independent = np.maximum(
         np.minimum(
-            outer_edges.edge_point_weight.dot(_PROFILE_ONES), markers.side_lengths_px.ravel()
+            outer_edges.edge_point_weight.dot(_ONES_TO_SUM_PROFILES),
+            markers.side_lengths_px.ravel(),
         ),
         4.0,
     )
@@ -347,7 +357,7 @@ def _refine_corners_by_lines_once(
                 blur_px,
                 sum(ends) / 4.0,
                 bool(is_white_clipped[i]),
-                rim.print_edge_sigma_cells,
+                rim.printed_edge_position_sigma_cells,
             ),
             are_corners_fitted=True,
             remaining_edge_shift_sigma_px=applied.sigma_px,
@@ -366,16 +376,16 @@ def _fit_lines(markers: MarkerSides, outer_edges: MeasuredEdges) -> tuple[Array,
     (4m,)."""
     w = (
         outer_edges.edge_point_weight
-        / np.maximum(outer_edges.edge_point_weight.dot(_PROFILE_ONES), 1e-9)[:, None]
+        / np.maximum(outer_edges.edge_point_weight.dot(_ONES_TO_SUM_PROFILES), 1e-9)[:, None]
     )
     x, y = outer_edges.edge_points_normalised[..., 0], outer_edges.edge_points_normalised[..., 1]
-    cx, cy = (w * x).dot(_PROFILE_ONES), (w * y).dot(_PROFILE_ONES)
+    cx, cy = (w * x).dot(_ONES_TO_SUM_PROFILES), (w * y).dot(_ONES_TO_SUM_PROFILES)
     dx, dy = x - cx[:, None], y - cy[:, None]
     wx = w * dx
     sxx, sxy, syy = (
-        (wx * dx).dot(_PROFILE_ONES),
-        (wx * dy).dot(_PROFILE_ONES),
-        (w * dy * dy).dot(_PROFILE_ONES),
+        (wx * dx).dot(_ONES_TO_SUM_PROFILES),
+        (wx * dy).dot(_ONES_TO_SUM_PROFILES),
+        (w * dy * dy).dot(_ONES_TO_SUM_PROFILES),
     )
     direction = 0.5 * np.arctan2(2.0 * sxy, sxx - syy)
     nx, ny = -np.sin(direction), np.cos(direction)
@@ -413,9 +423,9 @@ def edge_shift_prior_sigma_px(white_grey: float) -> float:
     grey level of the white paper, is so high that white is clipped (above 248), otherwise 0.15
     px."""
     return (
-        _EDGE_SHIFT_PRIOR_SIGMA_IF_CLIPPED_PX
-        if white_grey > MIN_CLIPPED_GREY
-        else _EDGE_SHIFT_PRIOR_SIGMA_PX
+        _BLOOMING_EDGE_SHIFT_PRIOR_SIGMA_IF_CLIPPED_PX
+        if white_grey > MIN_GREY_TO_COUNT_AS_CLIPPED
+        else _BLOOMING_EDGE_SHIFT_PRIOR_SIGMA_PX
     )
 
 
@@ -459,11 +469,13 @@ def _measure_edge_shift(
     far_px = far * (depth_px / (1.0 - r * r))[:, None]
     w = (
         inner_edges.edge_point_weight
-        * (inner_edges.blur_sigma_px < _MAX_EDGE_BLUR_SIGMA_CELLS * depth_px)[:, None]
+        * (inner_edges.blur_sigma_px < _MAX_INNER_EDGE_BLUR_TO_MEASURE_BLOOMING_CELLS * depth_px)[
+            :, None
+        ]
     )
-    w *= np.abs(far_px) < _MAX_EDGE_SHIFT_PX
+    w *= np.abs(far_px) < _MAX_INNER_EDGE_OFFSET_TO_MEASURE_BLOOMING_PX
     mass = w.sum(axis=1)
-    some = mass > _MIN_PROFILE_WEIGHT_SUM_PER_SIDE
+    some = mass > _MIN_PROFILE_WEIGHT_SUM_TO_USE_SIDE
     if not some.any():
         return EdgeShiftEstimate(0.0, prior_px)
     # If the sheet is curled, the outer edges move further than the inner ones, and the ends of a
@@ -478,7 +490,7 @@ def _measure_edge_shift(
     share = w / np.maximum(mass, 1e-9)[:, None]
     mean = (share * far_px).sum(axis=1)
     scatter = (share * (far_px - mean[:, None]) ** 2).sum(axis=1)
-    least = _MIN_EDGE_SHIFT_SIGMA_PX**2 + bent_px**2
+    least = _BLOOMING_EDGE_SHIFT_SIGMA_LOWER_BOUND_PX**2 + bent_px**2
     information = some / (2.0 * scatter / np.maximum(mass, 1.0) + least)
     total = float(information.sum())
     shift = float(information @ mean) / total
@@ -487,7 +499,7 @@ def _measure_edge_shift(
     variance = max(chi2, 1.0) / total
     # Errors that averaging does not reduce: the neighbours' blur and the print.
     variance += (2.0 * math.exp(-cell_size_px / 2.2)) ** 2 + (
-        rim.print_edge_sigma_cells * cell_size_px
+        rim.printed_edge_position_sigma_cells * cell_size_px
     ) ** 2
     prior = prior_px**2
     return EdgeShiftEstimate(
@@ -517,12 +529,20 @@ def _measure_outward_bow_of_side_ends_px(
         * markers.px_per_normalised_unit_per_side[four]
     )
     mass = np.maximum(
-        outer_edges.edge_point_weight[four] @ (_ZERO_MEAN_PARABOLA * _ZERO_MEAN_PARABOLA), 1e-9
+        outer_edges.edge_point_weight[four]
+        @ (_ZERO_MEAN_PARABOLA_ALONG_SIDE * _ZERO_MEAN_PARABOLA_ALONG_SIDE),
+        1e-9,
     )
-    bow_px = scale * ((outer_edges.edge_point_weight[four] * away) @ _ZERO_MEAN_PARABOLA) / mass
+    bow_px = (
+        scale
+        * ((outer_edges.edge_point_weight[four] * away) @ _ZERO_MEAN_PARABOLA_ALONG_SIDE)
+        / mass
+    )
     mean_px = float(bow_px @ _MEAN_OF_FOUR_WEIGHTS)
     noise_px = 0.25 * math.sqrt(float((rms_residual_px[four] ** 2 / mass).sum()))
-    return mean_px if abs(mean_px) > _MIN_SIGNIFICANT_BOW_SIGMAS * noise_px else 0.0
+    return (
+        mean_px if abs(mean_px) > _MIN_SIDE_BOW_TO_COUNT_AS_SIGNIFICANT_SIGMAS * noise_px else 0.0
+    )
 
 
 def _line_normal_outward_signs(markers: MarkerSides, line_nx_ny_c: Array) -> Array:
@@ -540,17 +560,19 @@ def _are_markers_accepted(
     inliers = np.count_nonzero(outer_edges.edge_point_weight > 0.0, axis=1)
     # Contrast between two samples near the ends of each profile: dark inside, white outside.
     contrast = np.abs(outer_edges.profile_greys[:, :, -3] - outer_edges.profile_greys[:, :, 2]).dot(
-        _PROFILE_ONES_F32
+        _ONES_TO_SUM_PROFILES_F32
     )
     lines = (rms_residual_px < _MAX_EDGE_FIT_RMS_RESIDUAL_PX) & (
-        inliers >= _MIN_INLIER_FRACTION * PROFILES_PER_SIDE
+        inliers >= _MIN_INLIER_PROFILE_FRACTION_PER_SIDE * PROFILES_PER_SIDE
     )
-    lines &= (contrast > _MIN_MEAN_EDGE_CONTRAST_GREY * PROFILES_PER_SIDE) & (
+    lines &= (contrast > _MIN_MEAN_EDGE_CONTRAST_TO_ACCEPT_SIDE_GREY * PROFILES_PER_SIDE) & (
         outer_edges.blur_sigma_px < 0.9 * outer_edges.window_half_length_px
     )
     displacement = corners_px - markers.raw_corners_px
     moved_px = np.hypot(displacement[..., 0], displacement[..., 1]).max(axis=1)
-    good = lines.reshape(-1, 4).all(axis=1) & (markers.mean_cell_size_per_marker_px > _MIN_CELL_PX)
+    good = lines.reshape(-1, 4).all(axis=1) & (
+        markers.mean_cell_size_per_marker_px > _MIN_CELL_SIZE_TO_ACCEPT_LINE_FIT_PX
+    )
     return np.asarray(
         good & (moved_px < np.maximum(1.6, 0.6 * markers.mean_cell_size_per_marker_px))
     )
@@ -567,15 +589,15 @@ def _corner_sigma_px(
     # If cells are only a few pixels wide, the blur of the inner pattern reaches the border's outer
     # edge.
     bend_px = (
-        _NEIGHBOUR_EDGE_ERROR_TO_BLUR_RATIO
+        _NEIGHBOUR_EDGE_ERROR_SIGMA_TO_BLUR_RATIO
         * blur_sigma_px
-        * math.exp(-cell_size_px / (_NEIGHBOUR_EDGE_ERROR_DECAY_BLUR_SIGMAS * blur_sigma_px))
+        * math.exp(-cell_size_px / (_NEIGHBOUR_EDGE_ERROR_DECAY_LENGTH_BLUR_SIGMAS * blur_sigma_px))
     )
-    reach_px = _EDGE_ERROR_PER_CUBED_BLUR_PER_PX2 * blur_sigma_px**3
-    clipped_px = CORNER_SIGMA_IF_WHITE_CLIPPED_PX if is_white_clipped else 0.0
+    reach_px = _CORNER_SIGMA_PER_BLUR_SIGMA_CUBED_PER_PX2 * blur_sigma_px**3
+    clipped_px = EXTRA_CORNER_SIGMA_IF_WHITE_CLIPPED_PX if is_white_clipped else 0.0
     # Printed edges deviate from their nominal positions.
     print_px = print_tolerance_cells * cell_size_px
-    noise_px = max(math.sqrt(line_end_variance_px2), MIN_LINE_SIGMA_PX)
+    noise_px = max(math.sqrt(line_end_variance_px2), FITTED_LINE_SIGMA_LOWER_BOUND_PX)
     return math.hypot(noise_px, bend_px, reach_px, clipped_px, print_px)
 
 
@@ -601,7 +623,8 @@ def _row_jitter_sigma_px(
     still = sum(line_end_variances_px2) / 4.0 - slope * mean
     return (
         math.sqrt(slope)
-        if slope > (_MIN_VERTICAL_TO_HORIZONTAL_SIDE_VARIANCE_RATIO - 1.0) * max(still, 0.0)
+        if slope
+        > (_MIN_VERTICAL_TO_HORIZONTAL_SIDE_VARIANCE_FOR_ROW_JITTER - 1.0) * max(still, 0.0)
         else 0.0
     )
 
@@ -612,7 +635,7 @@ def _row_jitter_sigma_px(
 
 
 # With smaller cells, the border's inner edge is not measured.
-_MIN_CELL_TO_MEASURE_EDGE_SHIFT_PX = 6.0
+_MIN_CELL_SIZE_TO_MEASURE_BLOOMING_PX = 6.0
 _SIDE_INDICES = np.arange(4)[:, None]
 
 
@@ -717,7 +740,7 @@ def measure_edges(
     black.
 
     The inner edges are None if `must_measure_inner_edges` is False or if that marker's cells are
-    not wider than 6 px (`_MIN_CELL_TO_MEASURE_EDGE_SHIFT_PX`).
+    not wider than 6 px (`_MIN_CELL_SIZE_TO_MEASURE_BLOOMING_PX`).
     """
     starts, lengths_px, depth_px = (
         markers.corners_normalised,
@@ -729,7 +752,8 @@ def measure_edges(
     rim = markers.cells_along_border[widest]
     must_measure_inner_edges = (
         must_measure_inner_edges
-        and float(markers.mean_cell_size_per_marker_px[widest]) > _MIN_CELL_TO_MEASURE_EDGE_SHIFT_PX
+        and float(markers.mean_cell_size_per_marker_px[widest])
+        > _MIN_CELL_SIZE_TO_MEASURE_BLOOMING_PX
     )
     if must_measure_inner_edges:
         r = 1.0 - 2.0 / rim.cells_per_side
@@ -842,28 +866,28 @@ def find_neighbour_edges(
 
 _PROFILE_POSITIONS_ALONG_SIDE_F32 = PROFILE_POSITIONS_ALONG_SIDE.astype(np.float32)
 # Variance of the window relative to the blur's variance, and its lower limit.
-_WINDOW_TO_BLUR_VARIANCE_RATIO, _MIN_WINDOW_VARIANCE_PX2 = 2.25, 0.81
+_NARROW_WINDOW_TO_BLUR_VARIANCE_RATIO, _MIN_NARROW_WINDOW_VARIANCE_PX2 = 2.25, 0.81
 # Neighbouring edges are assumed to cause at most this fraction of the gradient.
-_MAX_NEIGHBOUR_GRADIENT_FRACTION = 0.9
+_MAX_GRADIENT_FRACTION_FROM_NEIGHBOUR_EDGES = 0.9
 # Limits of an edge's second moment; the upper one is relative to the window's variance.
-_MIN_SECOND_MOMENT_PX2, _MAX_SECOND_MOMENT_TO_WINDOW_VARIANCE_RATIO = 0.01, 0.8
+_MIN_GRADIENT_SECOND_MOMENT_PX2, _MAX_GRADIENT_SECOND_MOMENT_TO_WINDOW_VARIANCE_RATIO = 0.01, 0.8
 # Half length of the wide window, in units of its standard deviation.
-_WIDE_WINDOW_HALF_LENGTH_PER_WINDOW_SIGMA = 1.0 / 0.6
+_WIDE_WINDOW_HALF_LENGTH_TO_SIGMA_RATIO = 1.0 / 0.6
 _TUKEY_CUTOFF_TO_MEDIAN_RESIDUAL_RATIO = 3.5 * 1.4826
 _PROFILE_POSITION_POWERS: Floats = (PROFILE_POSITIONS_ALONG_SIDE[:, None] ** np.arange(3)).astype(
     np.float32
 )
-_SAMPLE_ONES: Floats = np.ones(GRADIENT_SAMPLES_PER_PROFILE, dtype=np.float32)
+_ONES_TO_SUM_SAMPLES: Floats = np.ones(GRADIENT_SAMPLES_PER_PROFILE, dtype=np.float32)
 # A profile is usable if its gradient is at least this fraction of the mean gradient in its row.
-_MIN_PROFILE_TO_MEAN_GRADIENT_RATIO = 0.3
+_MIN_GRADIENT_TO_MEAN_RATIO_TO_USE_PROFILE = 0.3
 _MIN_TUKEY_CUTOFF_PX = 3.5 * 0.05  # A smaller cutoff would reject ordinary noise.
 # If the wide window is off by less than this, one iteration with the narrow window is enough.
-_MAX_LINE_CHANGE_TO_SKIP_ITERATION_PX = 0.2
-_MAX_CONVERGED_LINE_CHANGE_PX = 0.06
-_LINE_FIT_ITERATIONS = 3
-_OUT_OF_RANGE_OFFSET_PX = 1e6
+_MAX_LINE_MOTION_TO_SKIP_SECOND_ITERATION_PX = 0.2
+_MAX_LINE_MOTION_TO_COUNT_AS_CONVERGED_PX = 0.06
+_MAX_LINE_FIT_ITERATIONS = 3
+_PLACEHOLDER_OFFSET_FOR_UNUSABLE_PROFILE_PX = 1e6
 _PROFILES_PER_QUARTER_SIDE = PROFILES_PER_SIDE // 4
-_QUARTER_SIDE_ONES: Floats = np.ones(_PROFILES_PER_QUARTER_SIDE, dtype=np.float32)
+_ONES_TO_SUM_QUARTER_SIDE: Floats = np.ones(_PROFILES_PER_QUARTER_SIDE, dtype=np.float32)
 # Matrix (2, n) that maps the midmeans in both halves of a side to the line through them.
 _HALF_SIDE_MIDMEANS_TO_SLOPE: Floats = _PROFILE_POSITIONS_ALONG_SIDE_F32 * (
     0.5 / float(PROFILE_POSITIONS_ALONG_SIDE[PROFILES_PER_SIDE // 2 :].mean())
@@ -871,8 +895,10 @@ _HALF_SIDE_MIDMEANS_TO_SLOPE: Floats = _PROFILE_POSITIONS_ALONG_SIDE_F32 * (
 _HALF_SIDE_MIDMEANS_TO_LINE: Floats = np.stack(
     [0.5 - _HALF_SIDE_MIDMEANS_TO_SLOPE, 0.5 + _HALF_SIDE_MIDMEANS_TO_SLOPE]
 )
-_MEDIAN_PRESERVING_FILL_PX: Floats = np.where(
-    np.arange(PROFILES_PER_SIDE) % 2, _OUT_OF_RANGE_OFFSET_PX, -_OUT_OF_RANGE_OFFSET_PX
+_MEDIAN_PRESERVING_PLACEHOLDER_OFFSETS_PX: Floats = np.where(
+    np.arange(PROFILES_PER_SIDE) % 2,
+    _PLACEHOLDER_OFFSET_FOR_UNUSABLE_PROFILE_PX,
+    -_PLACEHOLDER_OFFSET_FOR_UNUSABLE_PROFILE_PX,
 ).astype(np.float32)
 
 
@@ -925,17 +951,17 @@ def locate_edges(
     blur_variance_px2 = np.ones(len(window_half_length_px), dtype=np.float32)
     line = weight = _fit_line_to_half_side_midmeans(edge_offsets_px, is_usable)
     moved_px = np.inf
-    for k in range(_LINE_FIT_ITERATIONS):
-        if k == 1 and moved_px < _MAX_LINE_CHANGE_TO_SKIP_ITERATION_PX:
+    for k in range(_MAX_LINE_FIT_ITERATIONS):
+        if k == 1 and moved_px < _MAX_LINE_MOTION_TO_SKIP_SECOND_ITERATION_PX:
             continue
         edge_offsets_px, is_usable, blur_variance_px2 = profiles.locate_in_narrow_window(
             line, blur_variance_px2
         )
         centre, weight = _fit_robust_line(
-            edge_offsets_px, is_usable, 2 if k == _LINE_FIT_ITERATIONS - 1 else 1
+            edge_offsets_px, is_usable, 2 if k == _MAX_LINE_FIT_ITERATIONS - 1 else 1
         )
         moved_px, line = float(np.abs(centre - line).max()), centre
-        if moved_px < _MAX_CONVERGED_LINE_CHANGE_PX:
+        if moved_px < _MAX_LINE_MOTION_TO_COUNT_AS_CONVERGED_PX:
             break
     return (
         edge_offsets_px.astype(np.float64),
@@ -958,7 +984,8 @@ class _EdgeProfiles:
         self.gradient = profile_greys[:, :, 1:] - profile_greys[:, :, :-1]
         # positions of the gradient samples, px (rows, steps)
         self.sample_positions_px = (
-            profile_half_length_px.astype(np.float32)[:, None] * GRADIENT_POSITIONS_HALF_LENGTHS
+            profile_half_length_px.astype(np.float32)[:, None]
+            * GRADIENT_POSITIONS_ALONG_PROFILE_HALF_LENGTHS
         )
         self.window_half_length_px, self.neighbour_distance_px = (
             window_half_length_px.astype(np.float32),
@@ -974,8 +1001,9 @@ class _EdgeProfiles:
         )
         self.edge_locatable_f32 = neighbours.is_edge_locatable_per_profile.astype(np.float32)
         # The sum over a row's profiles times this factor is the minimum gradient of a usable one.
-        self.min_gradient_to_row_sum_ratio = _MIN_PROFILE_TO_MEAN_GRADIENT_RATIO / np.maximum(
-            self.edge_locatable_f32.dot(_PROFILE_ONES_F32), 1.0
+        self.min_gradient_to_row_sum_ratio = (
+            _MIN_GRADIENT_TO_MEAN_RATIO_TO_USE_PROFILE
+            / np.maximum(self.edge_locatable_f32.dot(_ONES_TO_SUM_PROFILES_F32), 1.0)
         )
 
     def locate_in_wide_window(self) -> tuple[Floats, NDArray[np.bool_]]:
@@ -985,7 +1013,7 @@ class _EdgeProfiles:
         whether its gradient is strong enough."""
         spread = (
             self.sample_positions_px
-            * (_WIDE_WINDOW_HALF_LENGTH_PER_WINDOW_SIGMA / self.window_half_length_px)[:, None]
+            * (_WIDE_WINDOW_HALF_LENGTH_TO_SIGMA_RATIO / self.window_half_length_px)[:, None]
         )
         spread *= spread
         window = np.empty((*self.sample_positions_px.shape, 2), dtype=np.float32)
@@ -994,7 +1022,8 @@ class _EdgeProfiles:
         moments: Floats = np.maximum(self.gradient, 0.0) @ window
         total = moments[..., 0] * self.edge_locatable_f32
         is_usable = (
-            total > (total.dot(_PROFILE_ONES_F32) * self.min_gradient_to_row_sum_ratio)[:, None]
+            total
+            > (total.dot(_ONES_TO_SUM_PROFILES_F32) * self.min_gradient_to_row_sum_ratio)[:, None]
         )
         return np.divide(moments[..., 1], np.where(is_usable, total, 1.0)), is_usable
 
@@ -1011,7 +1040,8 @@ class _EdgeProfiles:
         # The second moment under a Gaussian window w is m2 with 1/m2 = 1/blur^2 + 1/w^2.
         w2 = np.minimum(
             np.maximum(
-                _WINDOW_TO_BLUR_VARIANCE_RATIO * blur_variance_px2, _MIN_WINDOW_VARIANCE_PX2
+                _NARROW_WINDOW_TO_BLUR_VARIANCE_RATIO * blur_variance_px2,
+                _MIN_NARROW_WINDOW_VARIANCE_PX2,
             ),
             self.max_window_variance_px2,
         )
@@ -1019,35 +1049,37 @@ class _EdgeProfiles:
         mass = squared * (-0.5 / w2)[:, None, None]
         np.exp(mass, out=mass)
         mass *= self.gradient
-        total = (mass @ _SAMPLE_ONES) * self.edge_locatable_f32
+        total = (mass @ _ONES_TO_SUM_SAMPLES) * self.edge_locatable_f32
         is_usable = (
             total
-            > np.maximum(total.dot(_PROFILE_ONES_F32) * self.min_gradient_to_row_sum_ratio, 1e-9)[
-                :, None
-            ]
+            > np.maximum(
+                total.dot(_ONES_TO_SUM_PROFILES_F32) * self.min_gradient_to_row_sum_ratio, 1e-9
+            )[:, None]
         )
         # Share of the gradient, position and spread of a neighbouring edge, as seen through the
         # window.
         wide2 = w2 + blur_variance_px2
         place = self.neighbour_distance_px * w2 / wide2
         lost = np.exp(-0.5 * self.neighbour_distance_px * self.neighbour_distance_px / wide2)
-        share = np.minimum(self.neighbour_count * lost[:, None], _MAX_NEIGHBOUR_GRADIENT_FRACTION)
+        share = np.minimum(
+            self.neighbour_count * lost[:, None], _MAX_GRADIENT_FRACTION_FROM_NEIGHBOUR_EDGES
+        )
         total = np.where(is_usable, total / (1.0 - share), 1.0)
         relative *= mass
         first = (
-            relative @ _SAMPLE_ONES
+            relative @ _ONES_TO_SUM_SAMPLES
             + total * self.outer_minus_inner_neighbour_f32 * (lost * place)[:, None]
         )
         mass *= squared
         second = (
-            mass @ _SAMPLE_ONES
+            mass @ _ONES_TO_SUM_SAMPLES
             + total * share * (place * place + w2 * blur_variance_px2 / wide2)[:, None]
         )
-        moment = (second * is_usable).dot(_PROFILE_ONES_F32)
-        moment /= np.maximum((total * is_usable).dot(_PROFILE_ONES_F32), 1e-9)
+        moment = (second * is_usable).dot(_ONES_TO_SUM_PROFILES_F32)
+        moment /= np.maximum((total * is_usable).dot(_ONES_TO_SUM_PROFILES_F32), 1e-9)
         moment = np.minimum(
-            np.maximum(moment, _MIN_SECOND_MOMENT_PX2),
-            _MAX_SECOND_MOMENT_TO_WINDOW_VARIANCE_RATIO * w2,
+            np.maximum(moment, _MIN_GRADIENT_SECOND_MOMENT_PX2),
+            _MAX_GRADIENT_SECOND_MOMENT_TO_WINDOW_VARIANCE_RATIO * w2,
         )
         found2 = moment * w2 / (w2 - moment)
         # Correct for the window, which pulls the centroid towards its middle.
@@ -1062,17 +1094,17 @@ def _fit_line_to_half_side_midmeans(
     """Fit a line to each side through the midmeans (the means of the middle 50 %) of the usable
     edge offsets, px (rows, n), in both halves of its profiles. Up to a quarter of the profiles in
     each half may be outliers. Returns the line's offset on each profile, px (rows, n)."""
-    halves = np.where(is_usable, edge_offsets_px, _MEDIAN_PRESERVING_FILL_PX).reshape(
-        -1, 2, 2 * _PROFILES_PER_QUARTER_SIDE
-    )
+    halves = np.where(
+        is_usable, edge_offsets_px, _MEDIAN_PRESERVING_PLACEHOLDER_OFFSETS_PX
+    ).reshape(-1, 2, 2 * _PROFILES_PER_QUARTER_SIDE)
     halves.sort(axis=2)
     first = _PROFILES_PER_QUARTER_SIDE // 2
     middle = halves[:, :, first : first + _PROFILES_PER_QUARTER_SIDE]
     # Exclude fill values before the sum: added to such large values, the edge positions would be
     # lost to rounding.
-    shown = np.abs(middle) < _OUT_OF_RANGE_OFFSET_PX
-    count = shown @ _QUARTER_SIDE_ONES
-    mean = (middle * shown) @ _QUARTER_SIDE_ONES / np.maximum(count, 1.0)
+    shown = np.abs(middle) < _PLACEHOLDER_OFFSET_FOR_UNUSABLE_PROFILE_PX
+    count = shown @ _ONES_TO_SUM_QUARTER_SIDE
+    mean = (middle * shown) @ _ONES_TO_SUM_QUARTER_SIDE / np.maximum(count, 1.0)
     return np.asarray(np.where(count, mean, mean[:, ::-1]) @ _HALF_SIDE_MIDMEANS_TO_LINE)
 
 
@@ -1113,7 +1145,9 @@ def median_per_row(values: Floats, is_usable: NDArray[np.bool_]) -> Floats:
     and positive in odd columns. If as many are negative as positive, the result is the upper
     median. Otherwise, it is a usable value near the median.
     """
-    values = np.where(is_usable, values, _MEDIAN_PRESERVING_FILL_PX)
+    values = np.where(is_usable, values, _MEDIAN_PRESERVING_PLACEHOLDER_OFFSETS_PX)
     values.partition(PROFILES_PER_SIDE // 2, axis=1)
     found = values[:, PROFILES_PER_SIDE // 2]
-    return np.asarray(np.where(np.abs(found) < _OUT_OF_RANGE_OFFSET_PX, found, 0.0))
+    return np.asarray(
+        np.where(np.abs(found) < _PLACEHOLDER_OFFSET_FOR_UNUSABLE_PROFILE_PX, found, 0.0)
+    )

@@ -52,8 +52,8 @@ from perchctl.vision.markers.corners import (
 )
 from perchctl.vision.markers.detector import DetectorInput, is_any_marker_part_hidden
 from perchctl.vision.markers.edge_fit import (
+    FITTED_LINE_SIGMA_LOWER_BOUND_PX,
     GRADIENT_SAMPLES_PER_PROFILE,
-    MIN_LINE_SIGMA_PX,
     PROFILES_PER_SIDE,
     Floats,
     NeighbourEdges,
@@ -66,25 +66,26 @@ from perchctl.vision.markers.edge_fit import (
     window_and_profile_half_lengths_px,
 )
 from perchctl.vision.markers.pattern import (
-    MIN_CELL_GREY_MARGIN_TO_CONTRAST_RATIO,
-    MIN_CONTRAST_GREY,
+    MIN_CELL_MARGIN_FROM_THRESHOLD_TO_CONTRAST_RATIO,
+    MIN_CONTRAST_TO_COMPARE_CELLS_GREY,
     MIN_MATCHING_CELL_FRACTION,
     MarkerPattern,
 )
 from perchctl.vision.types import CameraModel, EdgeShiftEstimate, MarkerName
 
 # With smaller cells, a part of a side carries no information.
-MIN_CELL_FOR_PARTIAL_FIT_PX = 4.0
-_MAX_ITERATIONS, _MAX_CONVERGED_STEP_PX = 5, 0.05
+MIN_CELL_SIZE_TO_TRY_PARTIAL_FIT_PX = 4.0
+_MAX_FIT_ITERATIONS, _MAX_STEP_TO_COUNT_AS_CONVERGED_PX = 5, 0.05
 _MAX_EDGE_FIT_RMS_RESIDUAL_PX = 0.6
-_MAX_BLUR_TO_WINDOW_HALF_LENGTH_RATIO = 0.9
-_MAX_CORNER_SIGMA_SIDES = 0.02  # Corners with a larger standard deviation are rejected.
-_MIN_EDGE_SHIFT_SIGMA_PX = 0.01
+_MAX_BLUR_SIGMA_TO_WINDOW_HALF_LENGTH_RATIO = 0.9
+# Corners with a larger standard deviation are rejected.
+_MAX_CORNER_SIGMA_TO_ACCEPT_PARTIAL_FIT_SIDES = 0.02
+_BLOOMING_EDGE_SHIFT_SIGMA_LOWER_BOUND_PX = 0.01
 # Robust weights make the squared residuals smaller; this factor compensates for that.
-_ROBUST_WEIGHT_VARIANCE_CORRECTION = 1.3
-_MAX_HOMOGRAPHY_INCREMENT = 0.5
+_ROBUST_WEIGHT_VARIANCE_CORRECTION_FACTOR = 1.3
+_MAX_HOMOGRAPHY_INCREMENT_PER_ITERATION = 0.5
 # Three times the reach of a search window; the edges cannot move a fit further from its start.
-_MAX_MOTION_FROM_START_PX = 20.0
+_ASSUMED_MAX_MARKER_MOTION_DURING_FIT_PX = 20.0
 
 
 def fit_partly_visible_marker(
@@ -106,14 +107,14 @@ def fit_partly_visible_marker(
     pattern, camera = detector_input.setup.patterns[name], detector_input.camera
     if (
         not mean_side_px(start_corners_px) / pattern.cells_along_border.cells_per_side
-        >= MIN_CELL_FOR_PARTIAL_FIT_PX
+        >= MIN_CELL_SIZE_TO_TRY_PARTIAL_FIT_PX
     ):
         return None
     # Enough cells must be in the image wherever the fit may converge.
     in_picture = _is_point_in_image(
         _project_sample_points_px(start_corners_px, pattern, camera),
         detector_input.image.shape,
-        _MAX_MOTION_FROM_START_PX,
+        _ASSUMED_MAX_MARKER_MOTION_DURING_FIT_PX,
     )
     if not _are_enough_cells_visible(_is_cell_visible(in_picture, pattern), pattern, identified_by):
         return None
@@ -121,7 +122,7 @@ def fit_partly_visible_marker(
     if not np.isfinite(start).all() or side_lengths_px(start).min() < 1.0:
         return None
     H_pinhole_marker = homography_from_centred_square(start)
-    for k in range(_MAX_ITERATIONS):
+    for k in range(_MAX_FIT_ITERATIONS):
         visible_edges = find_visible_edges(detector_input, H_pinhole_marker, pattern)
         if visible_edges is None:
             return None
@@ -132,18 +133,18 @@ def fit_partly_visible_marker(
         )
         step = np.asarray(np.linalg.solve(N, g), dtype=np.float64)
         p = step[:8]
-        if not (np.isfinite(p).all() and np.abs(p).max() < _MAX_HOMOGRAPHY_INCREMENT):
+        if not (np.isfinite(p).all() and np.abs(p).max() < _MAX_HOMOGRAPHY_INCREMENT_PER_ITERATION):
             return None
         H_pinhole_marker = increment_homography(H_pinhole_marker, p)
         if (
             k > 0
             and float(np.abs(p[:6]).max() * visible_edges.px_per_half_side.mean())
-            < _MAX_CONVERGED_STEP_PX
+            < _MAX_STEP_TO_COUNT_AS_CONVERGED_PX
         ):
             break
     assert visible_edges is not None
-    residual_px = visible_edges.outward_edge_offset_px - (step @ A).reshape(
-        visible_edges.outward_edge_offset_px.shape
+    residual_px = visible_edges.outward_offset_from_predicted_edge_px - (step @ A).reshape(
+        visible_edges.outward_offset_from_predicted_edge_px.shape
     )
     found = _make_refined_corners(H_pinhole_marker, visible_edges, residual_px, N, pattern, camera)
     if found is None or not _has_matching_visible_cells(
@@ -155,16 +156,16 @@ def fit_partly_visible_marker(
 
 def is_fully_visible(detector_input: DetectorInput, corners: RefinedCorners) -> bool:
     """True if no part of the marker is hidden, and all its corners are inside the image and far
-    enough from the image border: at least `IMAGE_BORDER_MARGIN_PX` plus the standard deviation, px,
-    of the blur of the marker's blurriest side."""
-    margin_px = IMAGE_BORDER_MARGIN_PX + corners.blurriest_side_blur_sigma_px
+    enough from the image border: at least `MIN_EDGE_DISTANCE_FROM_IMAGE_BORDER_PX` plus the
+    standard deviation, px, of the blur of the marker's blurriest side."""
+    margin_px = MIN_EDGE_DISTANCE_FROM_IMAGE_BORDER_PX + corners.blurriest_side_blur_sigma_px
     return is_inside_image(
         corners.corners_px, detector_input.image.shape, margin_px
     ) and not is_any_marker_part_hidden(detector_input.hidden_mask, corners.corners_px)
 
 
 def _make_edge_normal_equations(
-    visible_edges: VisibleEdges, edge_shift_prior: EdgeShiftEstimate
+    visible_edges: MeasuredVisibleEdges, edge_shift_prior: EdgeShiftEstimate
 ) -> tuple[Array, Array, Array]:
     """Set up one Gauss-Newton step that moves the square to the visible edges, each of which is
     measured on n profiles (short lines across it, along which the image is sampled). The nine
@@ -201,7 +202,10 @@ def _make_edge_normal_equations(
         / PROFILES_PER_SIDE,
     )
     weighted = A * (visible_edges.profile_weight * worth[:, None]).ravel()
-    N, g = weighted.dot(A.T), weighted.dot(visible_edges.outward_edge_offset_px.ravel())
+    N, g = (
+        weighted.dot(A.T),
+        weighted.dot(visible_edges.outward_offset_from_predicted_edge_px.ravel()),
+    )
     # The standard deviation of an edge is not known yet, so it is assumed to be a tenth of a pixel.
     certain = (0.1 / edge_shift_prior.sigma_px) ** 2
     N[8, 8] += certain
@@ -212,7 +216,7 @@ def _make_edge_normal_equations(
 
 def _make_refined_corners(
     H_pinhole_marker: Array,
-    visible_edges: VisibleEdges,
+    visible_edges: MeasuredVisibleEdges,
     residual_px: Array,
     normal_matrix: Array,
     pattern: MarkerPattern,
@@ -222,7 +226,7 @@ def _make_refined_corners(
     with their covariance (8, 8) in pixels^2 of a pinhole camera. Returns None if an edge is so
     blurred that the window in which it was located does not contain it completely, if the RMS
     residual is above `_MAX_EDGE_FIT_RMS_RESIDUAL_PX`, or if the standard deviation of a corner is
-    above `_MAX_CORNER_SIGMA_SIDES` side lengths.
+    above `_MAX_CORNER_SIGMA_TO_ACCEPT_PARTIAL_FIT_SIDES` side lengths.
 
     Args:
         H_pinhole_marker: homography (3, 3) that projects the marker's coordinates, in half sides
@@ -241,7 +245,7 @@ def _make_refined_corners(
         not used.any()
         or (
             visible_edges.blur_sigma_to_window_half_length_ratio[used]
-            > _MAX_BLUR_TO_WINDOW_HALF_LENGTH_RATIO
+            > _MAX_BLUR_SIGMA_TO_WINDOW_HALF_LENGTH_RATIO
         ).any()
     ):
         return None
@@ -249,11 +253,11 @@ def _make_refined_corners(
         return None
     mean = (w * residual_px).sum(axis=1) / np.maximum(mass, 1e-9)
     scatter = float((w * (residual_px - mean[:, None]) ** 2).sum() / w.sum())
-    chi2 = float((mean**2 * mass).sum()) / max(scatter, MIN_LINE_SIGMA_PX**2)
+    chi2 = float((mean**2 * mass).sum()) / max(scatter, FITTED_LINE_SIGMA_LOWER_BOUND_PX**2)
     freedom = max(2.0 * np.count_nonzero(used) - 9.0, 1.0)
     noise2 = max(
-        _ROBUST_WEIGHT_VARIANCE_CORRECTION * scatter * max(chi2 / freedom, 1.0),
-        MIN_LINE_SIGMA_PX**2,
+        _ROBUST_WEIGHT_VARIANCE_CORRECTION_FACTOR * scatter * max(chi2 / freedom, 1.0),
+        FITTED_LINE_SIGMA_LOWER_BOUND_PX**2,
     )
     pinhole = apply_homography(H_pinhole_marker, CENTRED_SQUARE)
     corners_px = distort_to_px(
@@ -266,12 +270,15 @@ def _make_refined_corners(
     J = corners_jacobian_wrt_homography_increment(H_pinhole_marker)
     cov_px2: Array = J @ np.linalg.inv(normal_matrix[:8, :8]) @ J.T * noise2
     floor2 = (
-        MIN_LINE_SIGMA_PX**2
-        + (pattern.cells_along_border.print_edge_sigma_cells * cell_size_px) ** 2
+        FITTED_LINE_SIGMA_LOWER_BOUND_PX**2
+        + (pattern.cells_along_border.printed_edge_position_sigma_cells * cell_size_px) ** 2
     )
     cov_px2 = cov_px2 + np.eye(8) * (floor2 + 0.25 * np.exp(cell_size_px * (-2.0 / 1.8)))
     vaguest_px = math.sqrt(float(np.diagonal(cov_px2).max()))
-    if not (vaguest_px < _MAX_CORNER_SIGMA_SIDES * side_px and np.isfinite(corners_px).all()):
+    if not (
+        vaguest_px < _MAX_CORNER_SIGMA_TO_ACCEPT_PARTIAL_FIT_SIDES * side_px
+        and np.isfinite(corners_px).all()
+    ):
         return None
     shift_sigma_px = math.sqrt(noise2 * float(np.linalg.inv(normal_matrix)[8, 8]))
     return RefinedCorners(
@@ -279,7 +286,7 @@ def _make_refined_corners(
         sigma_px=math.sqrt(float(np.trace(cov_px2)) / 8.0),
         are_corners_fitted=True,
         remaining_edge_shift_sigma_px=min(
-            max(shift_sigma_px, _MIN_EDGE_SHIFT_SIGMA_PX),
+            max(shift_sigma_px, _BLOOMING_EDGE_SHIFT_SIGMA_LOWER_BOUND_PX),
             edge_shift_prior_sigma_px(visible_edges.white_grey),
         ),
         cov_px2=cov_px2,
@@ -292,13 +299,13 @@ def _make_refined_corners(
 IdentificationEvidence = Literal["bits", "track", "other_marker"]
 """What identifies a marker: its cells alone ("bits"), the position predicted for it ("track"), or
 the other marker."""
-_MIN_VISIBLE_CELL_FRACTION = 0.6
+_MIN_VISIBLE_CELL_FRACTION_TO_IDENTIFY = 0.6
 # A sample counts as glare if it is brighter than white by more than this fraction of the contrast,
 # or if it is at least as bright as this grey level although white is not.
-_MIN_GLARE_EXCESS_TO_CONTRAST_RATIO, _MIN_SATURATED_GREY = 0.25, 250.0
+_MIN_GLARE_ABOVE_WHITE_TO_CONTRAST_RATIO, _MIN_GREY_TO_COUNT_AS_SATURATED = 0.25, 250.0
 # Other codewords differ from the marker's in two bits.
-_MAX_INVISIBLE_BITS: dict[IdentificationEvidence, int] = {"bits": 1, "track": 4}
-_MAX_LENS_INVERSION_ERROR_PX = 0.5  # The lens model is valid where its inverse exists.
+_MAX_INVISIBLE_BITS_BY_EVIDENCE: dict[IdentificationEvidence, int] = {"bits": 1, "track": 4}
+_MAX_LENS_MODEL_ROUND_TRIP_ERROR_PX = 0.5  # The lens model is valid where its inverse exists.
 
 
 def _has_matching_visible_cells(
@@ -328,18 +335,20 @@ def _has_matching_visible_cells(
     high = float(np.median(grey[is_sample_visible & white_samples]))
     low = float(np.median(grey[is_sample_visible & ~white_samples]))
     contrast = high - low
-    if contrast < MIN_CONTRAST_GREY:
+    if contrast < MIN_CONTRAST_TO_COMPARE_CELLS_GREY:
         return False
-    is_sample_visible &= grey <= high + _MIN_GLARE_EXCESS_TO_CONTRAST_RATIO * contrast
-    if high < _MIN_SATURATED_GREY - _MIN_GLARE_EXCESS_TO_CONTRAST_RATIO * contrast:
-        is_sample_visible &= grey < _MIN_SATURATED_GREY
+    is_sample_visible &= grey <= high + _MIN_GLARE_ABOVE_WHITE_TO_CONTRAST_RATIO * contrast
+    if high < _MIN_GREY_TO_COUNT_AS_SATURATED - _MIN_GLARE_ABOVE_WHITE_TO_CONTRAST_RATIO * contrast:
+        is_sample_visible &= grey < _MIN_GREY_TO_COUNT_AS_SATURATED
     count = np.bincount(pattern.sample_cell_index, weights=is_sample_visible)
     means = np.bincount(pattern.sample_cell_index, weights=grey * is_sample_visible) / np.maximum(
         count, 1.0
     )
     is_cell_visible = _is_cell_visible(is_sample_visible, pattern)
     share = (means - 0.5 * (high + low)) / contrast * np.where(pattern.is_cell_white, 1.0, -1.0)
-    wrong = np.count_nonzero(is_cell_visible & (share < MIN_CELL_GREY_MARGIN_TO_CONTRAST_RATIO))
+    wrong = np.count_nonzero(
+        is_cell_visible & (share < MIN_CELL_MARGIN_FROM_THRESHOLD_TO_CONTRAST_RATIO)
+    )
     most_wrong = 0
     if identified_by == "other_marker":
         most_wrong = math.floor(
@@ -366,7 +375,7 @@ def _project_sample_points_px(
     at = distort_to_px(undistorted, camera)
     near = (
         np.abs(undistort_to_normalised(at, camera) - undistorted).max(axis=1) * camera.K[0, 0]
-        < _MAX_LENS_INVERSION_ERROR_PX
+        < _MAX_LENS_MODEL_ROUND_TRIP_ERROR_PX
     )
     return np.where(near[:, None], at, np.nan)
 
@@ -403,38 +412,39 @@ def _are_enough_cells_visible(
     most_unknown = (
         len(is_cell_visible)
         if identified_by == "other_marker"
-        else _MAX_INVISIBLE_BITS[identified_by]
+        else _MAX_INVISIBLE_BITS_BY_EVIDENCE[identified_by]
     )
     return bool(
         np.count_nonzero(pattern.is_cell_inside_border & ~is_cell_visible) <= most_unknown
-        and np.count_nonzero(is_cell_visible) >= _MIN_VISIBLE_CELL_FRACTION * len(is_cell_visible)
+        and np.count_nonzero(is_cell_visible)
+        >= _MIN_VISIBLE_CELL_FRACTION_TO_IDENTIFY * len(is_cell_visible)
     )
 
 
 # --- The visible edges of a marker: its sides, and the inner edges of its border ---
 
 
-IMAGE_BORDER_MARGIN_PX = 2.0
+MIN_EDGE_DISTANCE_FROM_IMAGE_BORDER_PX = 2.0
 """Closer than this to the image border, px, the blur of an edge would extend beyond the image."""
 # With smaller cells, the inner and the outer edge of the border are not separate.
 _MIN_CELL_TO_MEASURE_INNER_EDGE_PX = 6.0
 # A clean profile deviates from black on its dark side, and from white on its bright side, by less
 # than these fractions of the contrast.
 (
-    _MAX_DARK_SIDE_GREY_DEVIATION_TO_CONTRAST_RATIO,
-    _MAX_BRIGHT_SIDE_GREY_DEVIATION_TO_CONTRAST_RATIO,
+    _MAX_CLEAN_DARK_SIDE_DEVIATION_TO_CONTRAST_RATIO,
+    _MAX_CLEAN_BRIGHT_SIDE_DEVIATION_TO_CONTRAST_RATIO,
 ) = 0.2, 0.5
 _MIN_PARTIAL_MARKER_CONTRAST_GREY = 10.0
-_MIN_PROFILE_WEIGHT_SUM_PER_SIDE = 3.0
-_MIN_VISIBLE_EDGES = 4  # A square has eight unknowns, and an edge determines two of them.
-_MAX_PROFILE_COORDINATE_PX = 1e6
-_WINDOW_SAMPLE_OFFSETS_HALF_LENGTHS: Array = np.linspace(
+_MIN_PROFILE_WEIGHT_SUM_TO_USE_EDGE = 3.0
+_MIN_VISIBLE_EDGES_TO_FIT = 4  # A square has eight unknowns, and an edge determines two of them.
+_MAX_PLAUSIBLE_PROFILE_COORDINATE_PX = 1e6
+_HIDDEN_MASK_CHECK_OFFSETS_HALF_LENGTHS: Array = np.linspace(
     -1.0, 1.0, GRADIENT_SAMPLES_PER_PROFILE // 2 + 1
 )[:, None]
 
 
 @dataclass(frozen=True, eq=False)
-class VisibleEdges:
+class MeasuredVisibleEdges:
     """Edges of a marker (its sides and the inner edges of its border) measured in one iteration of
     the fit. Each of the m visible edges is measured on n profiles, which are short lines across it
     along which the image is sampled.
@@ -442,8 +452,8 @@ class VisibleEdges:
     Attributes:
         measured_points_half_sides: measured point of the edge on each profile (m, n, 2), in half
             sides from the marker's centre.
-        outward_edge_offset_px: distance (m, n) of each measured point from the edge as predicted by
-            the current homography, positive away from the marker's centre.
+        outward_offset_from_predicted_edge_px: distance (m, n) of each measured point from the edge
+            as predicted by the current homography, positive away from the marker's centre.
         profile_weight: weight (m, n) of each profile in the fit, 0 if it is not used.
         side_index: index (m,) of the side to which the edge is parallel and adjacent, 0 to 3. Side
             k runs from corner k to corner k + 1.
@@ -456,7 +466,7 @@ class VisibleEdges:
     """
 
     measured_points_half_sides: Array
-    outward_edge_offset_px: Array
+    outward_offset_from_predicted_edge_px: Array
     profile_weight: Array
     side_index: NDArray[np.intp]
     edge_distance_from_centre_half_sides: Array
@@ -467,11 +477,11 @@ class VisibleEdges:
 
 def find_visible_edges(
     detector_input: DetectorInput, H_pinhole_marker: Array, pattern: MarkerPattern
-) -> VisibleEdges | None:
+) -> MeasuredVisibleEdges | None:
     """Measure the visible edges of a marker: its sides and, if its cells are large enough, the
     inner edges of its border. `H_pinhole_marker` (3, 3) projects the marker's coordinates, in half
     sides from its centre, to pixels of a pinhole camera. Returns None if fewer than
-    `_MIN_VISIBLE_EDGES` edges are visible, or if they have too little contrast."""
+    `_MIN_VISIBLE_EDGES_TO_FIT` edges are visible, or if they have too little contrast."""
     camera, cells, corners = (
         detector_input.camera,
         pattern.cells_along_border.cells_per_side,
@@ -493,7 +503,7 @@ def find_visible_edges(
     ends = starts[:, NEXT_CORNER].reshape(-1, 2)
     origin, normal = make_profile_centres_and_normals(starts.reshape(-1, 2), ends, s, camera)
     # Far outside the image, a lens model may return any position, even NaN.
-    if not (np.abs(origin) < _MAX_PROFILE_COORDINATE_PX).all():
+    if not (np.abs(origin) < _MAX_PLAUSIBLE_PROFILE_COORDINATE_PX).all():
         return None
     # The paper is white outside the marker and, for the inner edges, inside the border.
     turn = float(np.sign(signed_double_area_clockwise(corners[None])[0]))
@@ -509,9 +519,9 @@ def find_visible_edges(
         detector_input, origin, normal, window_half_length_px
     )
     kept = np.flatnonzero(
-        np.count_nonzero(is_unobstructed, axis=1) >= _MIN_PROFILE_WEIGHT_SUM_PER_SIDE
+        np.count_nonzero(is_unobstructed, axis=1) >= _MIN_PROFILE_WEIGHT_SUM_TO_USE_EDGE
     )
-    if len(kept) < _MIN_VISIBLE_EDGES:
+    if len(kept) < _MIN_VISIBLE_EDGES_TO_FIT:
         return None
     side, at, scale_px = side[kept], at[kept], scale_px[kept]
     origin, normal, is_unobstructed = origin[kept], normal[kept], is_unobstructed[kept]
@@ -536,7 +546,7 @@ def find_visible_edges(
         profile_greys, profile_half_length_px, window_half_length_px, around
     )
     weight = np.where(good, weight, 0.0)
-    weight[weight.sum(axis=1) < _MIN_PROFILE_WEIGHT_SUM_PER_SIDE] = 0.0
+    weight[weight.sum(axis=1) < _MIN_PROFILE_WEIGHT_SUM_TO_USE_EDGE] = 0.0
     found = undistort_to_normalised((origin + offset_px[..., None] * normal).reshape(-1, 2), camera)
     own = apply_homography(
         np.asarray(np.linalg.inv(H_pinhole_marker)), normalised_to_pinhole_px(found, camera)
@@ -544,9 +554,9 @@ def find_visible_edges(
     if not np.isfinite(own).all():
         return None
     far = np.einsum("rni,ri->rn", own, SIDE_OUTWARD_NORMALS[side]) - at[:, None]
-    return VisibleEdges(
+    return MeasuredVisibleEdges(
         measured_points_half_sides=own,
-        outward_edge_offset_px=far * scale_px[:, None],
+        outward_offset_from_predicted_edge_px=far * scale_px[:, None],
         profile_weight=weight,
         side_index=side,
         edge_distance_from_centre_half_sides=at,
@@ -566,9 +576,12 @@ def _is_profile_in_view(
     # A profile is in the image if both of its ends are in the image.
     reach, last = (
         window_half_length_px[:, None, None] * np.abs(profile_direction),
-        (w - 1 - IMAGE_BORDER_MARGIN_PX, h - 1 - IMAGE_BORDER_MARGIN_PX),
+        (
+            w - 1 - MIN_EDGE_DISTANCE_FROM_IMAGE_BORDER_PX,
+            h - 1 - MIN_EDGE_DISTANCE_FROM_IMAGE_BORDER_PX,
+        ),
     )
-    x_and_y = (profile_centre_px - reach >= IMAGE_BORDER_MARGIN_PX) & (
+    x_and_y = (profile_centre_px - reach >= MIN_EDGE_DISTANCE_FROM_IMAGE_BORDER_PX) & (
         profile_centre_px + reach <= last
     )
     seen = x_and_y[..., 0] & x_and_y[..., 1]
@@ -576,7 +589,7 @@ def _is_profile_in_view(
         at = (
             profile_centre_px[:, :, None]
             + window_half_length_px[:, None, None, None]
-            * _WINDOW_SAMPLE_OFFSETS_HALF_LENGTHS
+            * _HIDDEN_MASK_CHECK_OFFSETS_HALF_LENGTHS
             * profile_direction[:, :, None]
         )
         pixel = np.rint(np.clip(np.nan_to_num(at), 0.0, (w - 1, h - 1))).astype(np.intp)
@@ -623,7 +636,7 @@ def _find_clean_edge_profiles(
     contrast = white - black
     if contrast < _MIN_PARTIAL_MARKER_CONTRAST_GREY:
         return None
-    good = (dark < black + _MAX_DARK_SIDE_GREY_DEVIATION_TO_CONTRAST_RATIO * contrast) & (
-        bright > white - _MAX_BRIGHT_SIDE_GREY_DEVIATION_TO_CONTRAST_RATIO * contrast
+    good = (dark < black + _MAX_CLEAN_DARK_SIDE_DEVIATION_TO_CONTRAST_RATIO * contrast) & (
+        bright > white - _MAX_CLEAN_BRIGHT_SIDE_DEVIATION_TO_CONTRAST_RATIO * contrast
     )
     return is_unobstructed & good, white

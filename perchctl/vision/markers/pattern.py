@@ -18,17 +18,17 @@ from perchctl.vision.markers.corners import (
     is_inside_image,
 )
 
-MIN_MARKER_SIDE_PX = 7.0  # A smaller marker looks like a blob.
-MIN_CONTRAST_GREY = 10.0
+MIN_MARKER_SIDE_TO_IDENTIFY_PX = 7.0  # A smaller marker looks like a blob.
+MIN_CONTRAST_TO_COMPARE_CELLS_GREY = 10.0
 # A cell must differ from the threshold by at least this fraction of the contrast.
-MIN_CELL_GREY_MARGIN_TO_CONTRAST_RATIO = 0.1
+MIN_CELL_MARGIN_FROM_THRESHOLD_TO_CONTRAST_RATIO = 0.1
 MIN_MATCHING_CELL_FRACTION = 0.8
 """Fraction of the cells that must have the right colour."""
-_MIN_PATTERN_CORRELATION = 0.6
+_MIN_CORRELATION_TO_COUNT_AS_MATCHING_PATTERN = 0.6
 # Within this distance from the centre, in half sides of the small marker, no cells are sampled,
 # because the small marker may hide them.
 _UNSAMPLED_CENTRE_TO_SMALL_MARKER_SIDE_RATIO = 1.25
-_SAMPLE_OFFSETS_CELLS: Array = np.array(
+_SAMPLE_OFFSETS_FROM_CELL_CENTRE_CELLS: Array = np.array(
     [[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0.22]]
 )
 
@@ -44,12 +44,13 @@ class CellsAlongBorder:
             black, at each position along each side (4, n).
         are_two_cells_next_to_border_white: 1.0 if that cell and the next one towards the marker's
             centre are both white, otherwise 0.0 (4, n).
-        print_edge_sigma_cells: standard deviation of a printed edge's position, in cells.
+        printed_edge_position_sigma_cells: standard deviation of a printed edge's position, in
+            cells.
     """
 
     is_cell_next_to_border_white: Array
     are_two_cells_next_to_border_white: Array
-    print_edge_sigma_cells: float = 0.0
+    printed_edge_position_sigma_cells: float = 0.0
 
     @property
     def cells_per_side(self) -> int:
@@ -68,9 +69,9 @@ class MarkerPattern:
             have sample points.
         sample_cell_index: the cell (n,) of each sample point.
         samples_per_cell: number of sample points in each cell, (cells,).
-        rotated_sample_templates: expected grey (4, n) at the sample points, one row for each
-            rotation of the marker (corners rolled by 0 to 3). Each row is blurred by half a cell
-            and normalised to zero mean and unit norm.
+        expected_sample_greys_per_rotation: expected grey (4, n) at the sample points, one row for
+            each rotation of the marker (corners rolled by 0 to 3). Each row is blurred by half a
+            cell and normalised to zero mean and unit norm.
         is_cell_white: True for a white cell, (cells,).
         is_cell_inside_border: True for a cell that is not part of the border, (cells,).
     """
@@ -80,18 +81,18 @@ class MarkerPattern:
     sample_points_half_sides: Array
     sample_cell_index: NDArray[np.intp]
     samples_per_cell: Array
-    rotated_sample_templates: Array
+    expected_sample_greys_per_rotation: Array
     is_cell_white: NDArray[np.bool_]
     is_cell_inside_border: NDArray[np.bool_]
 
 
 def make_cells_along_border(
-    bits: NDArray[np.uint8], print_edge_sigma_cells: float = 0.0
+    bits: NDArray[np.uint8], printed_edge_position_sigma_cells: float = 0.0
 ) -> CellsAlongBorder:
     """Return the colours of the two outermost layers of cells inside the black border of a marker
     with inner bits (n, n), 1 = white. The edge fits use them, because the blur of these cells may
-    reach the edges of the border. `print_edge_sigma_cells` is the standard deviation of a printed
-    edge's position, in cells."""
+    reach the edges of the border. `printed_edge_position_sigma_cells` is the standard deviation of
+    a printed edge's position, in cells."""
     n = len(bits)
 
     def ring(depth: int) -> Array:
@@ -104,7 +105,7 @@ def make_cells_along_border(
 
     white = np.pad(ring(0), ((0, 0), (1, 1)))
     second = np.pad(ring(1), ((0, 0), (1, 1)))
-    return CellsAlongBorder(white, white * second, print_edge_sigma_cells)
+    return CellsAlongBorder(white, white * second, printed_edge_position_sigma_cells)
 
 
 def make_marker_pattern(
@@ -118,8 +119,10 @@ def make_marker_pattern(
     middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
     x, y = np.meshgrid(middle, middle)
     centres = np.stack([x.ravel(), y.ravel()], axis=1)
-    sample_points_half_sides = (centres[:, None] + _SAMPLE_OFFSETS_CELLS * 2.0 / n).reshape(-1, 2)
-    owner = np.repeat(np.arange(n * n), len(_SAMPLE_OFFSETS_CELLS))
+    sample_points_half_sides = (
+        centres[:, None] + _SAMPLE_OFFSETS_FROM_CELL_CENTRE_CELLS * 2.0 / n
+    ).reshape(-1, 2)
+    owner = np.repeat(np.arange(n * n), len(_SAMPLE_OFFSETS_FROM_CELL_CENTRE_CELLS))
     free = (
         np.abs(sample_points_half_sides).max(axis=1)
         > _UNSAMPLED_CENTRE_TO_SMALL_MARKER_SIDE_RATIO * drawing.small_to_large_side_ratio
@@ -138,7 +141,7 @@ def make_marker_pattern(
         sample_points_half_sides=np.ascontiguousarray(sample_points_half_sides[free]),
         sample_cell_index=own,
         samples_per_cell=np.bincount(own).astype(np.float64),
-        rotated_sample_templates=np.stack(turns),
+        expected_sample_greys_per_rotation=np.stack(turns),
         is_cell_white=drawing.cell_whiteness.ravel()[kept] > 0.5,
         is_cell_inside_border=np.abs(centres).max(axis=1)[kept] < 1.0 - 2.0 / n,
     )
@@ -147,8 +150,9 @@ def make_marker_pattern(
 def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern) -> bool:
     """True if every cell of a marker with corners (4, 2) px in the image clearly has the colour of
     its cell in the pattern: its mean grey is on the right side of the middle between the medians of
-    black and white, by at least `MIN_CELL_GREY_MARGIN_TO_CONTRAST_RATIO` of the contrast. False if
-    the contrast is below `MIN_CONTRAST_GREY` or the marker is partly outside the image."""
+    black and white, by at least `MIN_CELL_MARGIN_FROM_THRESHOLD_TO_CONTRAST_RATIO` of the contrast.
+    False if the contrast is below `MIN_CONTRAST_TO_COMPARE_CELLS_GREY` or the marker is partly
+    outside the image."""
     means = _mean_grey_per_cell(image, corners_px, pattern)
     if means is None:
         return False
@@ -157,9 +161,9 @@ def has_matching_cells(image: NDArray[np.uint8], corners_px: Array, pattern: Mar
     high = float(np.partition(white, len(white) // 2)[len(white) // 2])
     low = float(np.partition(black, len(black) // 2)[len(black) // 2])
     contrast = high - low
-    middle, margin = 0.5 * (high + low), MIN_CELL_GREY_MARGIN_TO_CONTRAST_RATIO * contrast
+    middle, margin = 0.5 * (high + low), MIN_CELL_MARGIN_FROM_THRESHOLD_TO_CONTRAST_RATIO * contrast
     return bool(
-        contrast >= MIN_CONTRAST_GREY
+        contrast >= MIN_CONTRAST_TO_COMPARE_CELLS_GREY
         and white.min() > middle + margin
         and black.max() < middle - margin
     )
@@ -171,24 +175,28 @@ def has_mostly_matching_cells(
     """True if more than `MIN_MATCHING_CELL_FRACTION` of the cells of a marker with corners (4, 2)
     px in the image have the colour of their cell in the pattern: their mean grey is on the right
     side of the middle between the medians of black and white. False if the contrast is below
-    `MIN_CONTRAST_GREY` or the marker is partly outside the image."""
+    `MIN_CONTRAST_TO_COMPARE_CELLS_GREY` or the marker is partly outside the image."""
     means = _mean_grey_per_cell(image, corners_px, pattern)
     if means is None:
         return False
     high, low = np.median(means[pattern.is_cell_white]), np.median(means[~pattern.is_cell_white])
     right = (means > 0.5 * (high + low)) == pattern.is_cell_white
-    return bool(high - low >= MIN_CONTRAST_GREY and right.mean() > MIN_MATCHING_CELL_FRACTION)
+    return bool(
+        high - low >= MIN_CONTRAST_TO_COMPARE_CELLS_GREY
+        and right.mean() > MIN_MATCHING_CELL_FRACTION
+    )
 
 
 def is_correlated_with_pattern(
     image: NDArray[np.uint8], corners_px: Array, pattern: MarkerPattern
 ) -> bool:
     """True if the grey values in the cells of a marker with corners (4, 2) px in the image have a
-    correlation of more than `_MIN_PATTERN_CORRELATION` with the pattern. The first corner is taken
-    as the marker's top left as printed; other rotations are not tried. False if there is no
-    contrast or the marker is partly outside the image."""
+    correlation of more than `_MIN_CORRELATION_TO_COUNT_AS_MATCHING_PATTERN` with the pattern. The
+    first corner is taken as the marker's top left as printed; other rotations are not tried. False
+    if there is no contrast or the marker is partly outside the image."""
     return (
-        float(correlate_pattern_rotations(image, corners_px, pattern)[0]) > _MIN_PATTERN_CORRELATION
+        float(correlate_pattern_rotations(image, corners_px, pattern)[0])
+        > _MIN_CORRELATION_TO_COUNT_AS_MATCHING_PATTERN
     )
 
 
@@ -204,9 +212,9 @@ def correlate_pattern_rotations(
     grey -= grey.mean()
     spread = float(np.linalg.norm(grey))
     # If half of the samples are black and half are white, they differ by two standard deviations.
-    if spread < 0.5 * MIN_CONTRAST_GREY * math.sqrt(len(grey)):
+    if spread < 0.5 * MIN_CONTRAST_TO_COMPARE_CELLS_GREY * math.sqrt(len(grey)):
         return np.zeros(4)
-    return np.asarray(pattern.rotated_sample_templates @ grey / spread)
+    return np.asarray(pattern.expected_sample_greys_per_rotation @ grey / spread)
 
 
 def _mean_grey_per_cell(
@@ -252,8 +260,9 @@ def _sample_blurred_drawing(drawing: MarkerDrawing, sample_points_half_sides: Ar
 # --- A marker's drawing on a grid: whiteness of each node, sharp and blurred ---
 
 
-_FITTED_WHITE_MARGIN_CELLS = 0.6  # width of the white margin around the border that is fitted
-BLUR_MARGIN_NODES = 12
+# Width of the white margin around the border that is fitted.
+_PHOTOMETRIC_FIT_WHITE_MARGIN_CELLS = 0.6
+GRID_MARGIN_FOR_BLUR_NODES = 12
 """Number of nodes that are added on all sides to make room for the blur."""
 
 
@@ -285,7 +294,7 @@ class MarkerDrawing:
     def photometric_fit_half_width_half_sides(self) -> float:
         """Half the side, in half sides of the marker, of the square that the photometric fit
         compares with the image."""
-        return 1.0 + _FITTED_WHITE_MARGIN_CELLS * 2.0 / len(self.cell_whiteness)
+        return 1.0 + _PHOTOMETRIC_FIT_WHITE_MARGIN_CELLS * 2.0 / len(self.cell_whiteness)
 
 
 def make_marker_drawing(
@@ -349,9 +358,9 @@ def _cell_coverage(
 
 def _add_margin_nodes(node_positions_half_sides: Array, node_half_width_half_sides: float) -> Array:
     """Return the positions of a grid's nodes along one axis, in half sides from the marker's
-    centre, after adding `BLUR_MARGIN_NODES` nodes at both ends to make room for the blur.
+    centre, after adding `GRID_MARGIN_FOR_BLUR_NODES` nodes at both ends to make room for the blur.
     `node_half_width_half_sides` is half the spacing of the nodes."""
-    more = 2.0 * node_half_width_half_sides * np.arange(1, BLUR_MARGIN_NODES + 1)
+    more = 2.0 * node_half_width_half_sides * np.arange(1, GRID_MARGIN_FOR_BLUR_NODES + 1)
     return np.concatenate(
         [
             node_positions_half_sides[0] - more[::-1],
@@ -366,8 +375,8 @@ def render_whiteness_and_off_paper_fraction(
     drawing: MarkerDrawing, nodes_per_side: int
 ) -> tuple[NDArray[np.float32], ...]:
     """Render the drawing without blur on a grid of n by n nodes (`nodes_per_side`) over the square
-    that the photometric fit compares with the image. A margin of m = `BLUR_MARGIN_NODES` nodes is
-    added on all sides, so that the result can be blurred afterwards.
+    that the photometric fit compares with the image. A margin of m = `GRID_MARGIN_FOR_BLUR_NODES`
+    nodes is added on all sides, so that the result can be blurred afterwards.
 
     The first array returned, (n + 2m, n + 2m), is the whiteness of each node, 0 to 1: the mean over
     the small square around it. If the drawing has a `paper_half_width_half_sides`, a second array
@@ -396,8 +405,8 @@ def render_black_square(cells_per_side: int, nodes_per_side: int) -> NDArray[np.
     pattern alone.
 
     The result (n + 2m, n + 2m) covers a grid of n by n nodes (`nodes_per_side`) and a margin of m =
-    `BLUR_MARGIN_NODES` nodes around them. `cells_per_side`, the marker's number of cells including
-    the border, determines how far the nodes extend beyond the square."""
+    `GRID_MARGIN_FOR_BLUR_NODES` nodes around them. `cells_per_side`, the marker's number of cells
+    including the border, determines how far the nodes extend beyond the square."""
     return render_whiteness_and_off_paper_fraction(
         MarkerDrawing(np.zeros((cells_per_side, cells_per_side))), nodes_per_side
     )[0]
@@ -408,8 +417,8 @@ def render_cells(
 ) -> NDArray[np.float32]:
     """Return the whiteness of the drawing, 0 to 1, at the nodes of a square grid, without blur. The
     nodes are at `node_positions_half_sides` (n,) along both axes, in half sides from the marker's
-    centre, and the result also has a margin of m = `BLUR_MARGIN_NODES` nodes on all sides: (n + 2m,
-    n + 2m). Each value is the mean over the node's square, which extends
+    centre, and the result also has a margin of m = `GRID_MARGIN_FOR_BLUR_NODES` nodes on all sides:
+    (n + 2m, n + 2m). Each value is the mean over the node's square, which extends
     `node_half_width_half_sides`, half the spacing, to each side. The surroundings of the marker are
     white."""
     wide = _add_margin_nodes(node_positions_half_sides, node_half_width_half_sides)
@@ -461,7 +470,9 @@ def blurred_cell_coverage(
         borderType=cv2.BORDER_REPLICATE,
     )
     return np.asarray(
-        soft[BLUR_MARGIN_NODES : BLUR_MARGIN_NODES + len(node_positions_half_sides)],
+        soft[
+            GRID_MARGIN_FOR_BLUR_NODES : GRID_MARGIN_FOR_BLUR_NODES + len(node_positions_half_sides)
+        ],
         dtype=np.float64,
     )
 
@@ -472,7 +483,7 @@ def blur_node_values(
     """Return the values `sharp_node_values` (k, k) at the nodes of a grid after a Gaussian blur.
 
     The blur has the standard deviation `blur_sigma_nodes`, in node spacings. Both arrays include a
-    margin of `BLUR_MARGIN_NODES` nodes on all sides, in which the result is less accurate.
+    margin of `GRID_MARGIN_FOR_BLUR_NODES` nodes on all sides, in which the result is less accurate.
     """
     soft = cv2.GaussianBlur(
         sharp_node_values, (0, 0), blur_sigma_nodes, borderType=cv2.BORDER_REPLICATE

@@ -42,7 +42,7 @@ from perchctl.vision.markers.corners import (
     increment_homography,
 )
 from perchctl.vision.markers.pattern import (
-    BLUR_MARGIN_NODES,
+    GRID_MARGIN_FOR_BLUR_NODES,
     MarkerDrawing,
     blur_node_values,
     blurred_cell_coverage,
@@ -52,42 +52,44 @@ from perchctl.vision.markers.pattern import (
 from perchctl.vision.types import CameraModel
 
 _MAX_GRID_NODES_PER_SIDE, _MIN_GRID_NODES_PER_SIDE = 44, 18
-_NODE_SPACING_PX = 0.8
-_MAX_ITERATIONS = 12
-_EARLY_CHECK_ITERATIONS, _MIN_EARLY_CORRELATION = 4, 0.7
+_NOMINAL_NODE_SPACING_PX = 0.8
+_MAX_FIT_ITERATIONS = 12
+_ITERATIONS_BEFORE_CORRELATION_CHECK, _MIN_CORRELATION_TO_CONTINUE_FIT = 4, 0.7
 """Number of iterations after which the fit fails unless its correlation has reached
-`_MIN_EARLY_CORRELATION`. The correlation of a marker is above 0.9 after two iterations."""
-_MAX_CONVERGED_STEP_PX = 0.05  # After a step this small, the next one is usually a tenth of it.
+`_MIN_CORRELATION_TO_CONTINUE_FIT`. The correlation of a marker is above 0.9 after two
+iterations."""
+# After a step this small, the next one is usually a tenth of it.
+_MAX_STEP_TO_COUNT_AS_CONVERGED_PX = 0.05
 # After a larger motion, the lens distortion is computed again.
-_MAX_DISTORTION_REUSE_MOTION_PX = 0.3
-_MAX_HOMOGRAPHY_INCREMENT = 0.5  # With a larger increment, the fit has diverged.
+_MAX_MARKER_MOTION_TO_REUSE_DISTORTION_PX = 0.3
+_MAX_HOMOGRAPHY_INCREMENT_PER_ITERATION = 0.5  # With a larger increment, the fit has diverged.
 # Standard deviations of the change of shape since the start, in half sides: of rotations and
 # scales, and of the perspective.
-_ROTATION_SCALE_PRIOR_SIGMA, _PERSPECTIVE_PRIOR_SIGMA = 0.2, 0.03
+_ROTATION_AND_SCALE_CHANGE_PRIOR_SIGMA, _PERSPECTIVE_CHANGE_PRIOR_SIGMA = 0.2, 0.03
 # Standard deviation of the bend of the tone curve, relative to the gain.
-_TONE_CURVE_BEND_PRIOR_SIGMA = 0.5
-_MIN_BLUR_SIGMA_PX, _MAX_BLUR_SIGMA_CELLS = 0.35, 1.6
+_TONE_CURVE_BEND_TO_GAIN_PRIOR_SIGMA = 0.5
+_MIN_FITTED_BLUR_SIGMA_PX, _MAX_FITTED_BLUR_SIGMA_CELLS = 0.35, 1.6
 # In one iteration, the variance of the blur changes at most by this fraction of itself, or by one
 # squared node spacing if that is larger.
-_MAX_BLUR_VARIANCE_STEP_FRACTION = 0.5
-_RERENDER_BLUR_CHANGE_FRACTION, _RERENDER_BLUR_CHANGE_CELLS = 0.05, 0.02
+_MAX_BLUR_VARIANCE_CHANGE_FRACTION_PER_ITERATION = 0.5
+_MIN_BLUR_CHANGE_TO_RERENDER_FRACTION, _MIN_BLUR_CHANGE_TO_RERENDER_CELLS = 0.05, 0.02
 """The drawing is not rendered again for a change of the blur that is below both limits: a fraction
 of the blur, and a fraction of a cell."""
-_MIN_FITTED_CONTRAST_GREY = 10.0
-_MIN_SIDE_PX, _MAX_SIDE_PX = 4.0, 2000.0
+_MIN_CONTRAST_TO_CONTINUE_FIT_GREY = 10.0
+_MIN_START_SIDE_TO_FIT_PX, _MAX_START_SIDE_TO_FIT_PX = 4.0, 2000.0
 # Indices of the unknowns: homography increment, blur, illumination.
 _HOMOGRAPHY_SLICE, _BLUR_VARIANCE_INDEX, _FIRST_ILLUMINATION_INDEX = slice(0, 8), 8, 9
 _HOMOGRAPHY_INCREMENT_PRIOR_INFORMATION: Array = (
     np.array(
         [
-            _ROTATION_SCALE_PRIOR_SIGMA,
-            _ROTATION_SCALE_PRIOR_SIGMA,
+            _ROTATION_AND_SCALE_CHANGE_PRIOR_SIGMA,
+            _ROTATION_AND_SCALE_CHANGE_PRIOR_SIGMA,
             1e3,
-            _ROTATION_SCALE_PRIOR_SIGMA,
-            _ROTATION_SCALE_PRIOR_SIGMA,
+            _ROTATION_AND_SCALE_CHANGE_PRIOR_SIGMA,
+            _ROTATION_AND_SCALE_CHANGE_PRIOR_SIGMA,
             1e3,
-            _PERSPECTIVE_PRIOR_SIGMA,
-            _PERSPECTIVE_PRIOR_SIGMA,
+            _PERSPECTIVE_CHANGE_PRIOR_SIGMA,
+            _PERSPECTIVE_CHANGE_PRIOR_SIGMA,
         ]
     )
     ** -2.0
@@ -109,14 +111,14 @@ class DrawingAlignment:
             drawing.
         pattern_to_border_contrast_ratio: contrast of the inner pattern in the image, divided by the
             contrast between black and white of the whole fitted drawing.
-        largest_cell_grey_deviation_to_contrast_ratio: largest deviation of a cell's mean grey from
+        largest_cell_grey_residual_to_contrast_ratio: largest deviation of a cell's mean grey from
             its mean grey in the fitted drawing, relative to the contrast of black and white.
         worst_cell_opposite_colour_likeness: how much the worst cell looks like the opposite colour,
             from 0 (as drawn) to 1 (flipped bit).
         largest_opposite_colour_likeness_sigma: standard deviation of this measure for the cell in
             which it is least certain.
         blur_sigma_px: standard deviation of the fitted blur.
-        largest_motion_from_start_px: largest change, in x or y, of a fitted corner from the
+        largest_corner_motion_from_start_px: largest change, in x or y, of a fitted corner from the
             position at which the fit started.
     """
 
@@ -125,11 +127,11 @@ class DrawingAlignment:
     fit_correlation: float
     inner_pattern_correlation: float
     pattern_to_border_contrast_ratio: float
-    largest_cell_grey_deviation_to_contrast_ratio: float
+    largest_cell_grey_residual_to_contrast_ratio: float
     worst_cell_opposite_colour_likeness: float
     largest_opposite_colour_likeness_sigma: float
     blur_sigma_px: float
-    largest_motion_from_start_px: float
+    largest_corner_motion_from_start_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,11 +179,11 @@ def align_drawing(
         return None
     sides = np.hypot(*(start - np.roll(start, 1, axis=0)).T)
     side_px, reach = float(sides.mean()), drawing.photometric_fit_half_width_half_sides
-    if float(sides.min()) < _MIN_SIDE_PX or side_px > _MAX_SIDE_PX:
+    if float(sides.min()) < _MIN_START_SIDE_TO_FIT_PX or side_px > _MAX_START_SIDE_TO_FIT_PX:
         return None
     n = int(
         np.clip(
-            math.ceil(reach * side_px / _NODE_SPACING_PX),
+            math.ceil(reach * side_px / _NOMINAL_NODE_SPACING_PX),
             _MIN_GRID_NODES_PER_SIDE,
             _MAX_GRID_NODES_PER_SIDE,
         )
@@ -198,7 +200,9 @@ def align_drawing(
         return render_blurred(drawing, n, round(math.log(blur_px / node_px) / _LOG_BLUR_TABLE_STEP))
 
     def limit_blur_px(blur_px: float) -> float:
-        return min(max(blur_px, _MIN_BLUR_SIGMA_PX), _MAX_BLUR_SIGMA_CELLS * cell_size_px)
+        return min(
+            max(blur_px, _MIN_FITTED_BLUR_SIGMA_PX), _MAX_FITTED_BLUR_SIGMA_CELLS * cell_size_px
+        )
 
     rendered_drawing = drawn(limit_blur_px(initial_blur_sigma_px))
     distortion_shift_minus_patch_corner_px, since_lens_px, homography_increment_from_start = (
@@ -206,8 +210,8 @@ def align_drawing(
         0.0,
         np.zeros(8),
     )
-    for k in range(_MAX_ITERATIONS):
-        if since_lens_px > _MAX_DISTORTION_REUSE_MOTION_PX:
+    for k in range(_MAX_FIT_ITERATIONS):
+        if since_lens_px > _MAX_MARKER_MOTION_TO_REUSE_DISTORTION_PX:
             distortion_shift_minus_patch_corner_px, since_lens_px = (
                 lens_distortion_shift_px(grid, H_pinhole_marker, camera) - first,
                 0.0,
@@ -217,15 +221,18 @@ def align_drawing(
         if equations is None:
             return None
         if (
-            k == _EARLY_CHECK_ITERATIONS
-            and correlation_from_residual(grey, equations.grey_residual) < _MIN_EARLY_CORRELATION
+            k == _ITERATIONS_BEFORE_CORRELATION_CHECK
+            and correlation_from_residual(grey, equations.grey_residual)
+            < _MIN_CORRELATION_TO_CONTINUE_FIT
         ):
             return None
         step = np.asarray(
             np.linalg.solve(equations.normal_matrix, equations.right_hand_side), dtype=np.float64
         )
         p = step[_HOMOGRAPHY_SLICE]
-        if not (np.isfinite(p).all() and np.abs(p).max() <= _MAX_HOMOGRAPHY_INCREMENT):
+        if not (
+            np.isfinite(p).all() and np.abs(p).max() <= _MAX_HOMOGRAPHY_INCREMENT_PER_ITERATION
+        ):
             return None
         H_pinhole_marker, homography_increment_from_start = (
             increment_homography(H_pinhole_marker, p),
@@ -234,16 +241,18 @@ def align_drawing(
         motion_px = 0.5 * side_px * float(np.abs(p[:6]).max())
         since_lens_px += motion_px
         sigma2 = rendered_drawing.blur_sigma_nodes**2
-        most = max(1.0, _MAX_BLUR_VARIANCE_STEP_FRACTION * sigma2)
+        most = max(1.0, _MAX_BLUR_VARIANCE_CHANGE_FRACTION_PER_ITERATION * sigma2)
         squared = sigma2 + float(np.clip(step[_BLUR_VARIANCE_INDEX], -most, most))
         wanted_px = limit_blur_px(math.sqrt(max(squared, 1e-3)) * node_px)
         drawn_px = rendered_drawing.blur_sigma_nodes * node_px
         if abs(wanted_px - drawn_px) > min(
-            _RERENDER_BLUR_CHANGE_FRACTION * drawn_px, _RERENDER_BLUR_CHANGE_CELLS * cell_size_px
+            _MIN_BLUR_CHANGE_TO_RERENDER_FRACTION * drawn_px,
+            _MIN_BLUR_CHANGE_TO_RERENDER_CELLS * cell_size_px,
         ):
             rendered_drawing = drawn(wanted_px)
         elif (
-            motion_px < _MAX_CONVERGED_STEP_PX and since_lens_px <= _MAX_DISTORTION_REUSE_MOTION_PX
+            motion_px < _MAX_STEP_TO_COUNT_AS_CONVERGED_PX
+            and since_lens_px <= _MAX_MARKER_MOTION_TO_REUSE_DISTORTION_PX
         ):
             break
     assert equations is not None
@@ -282,13 +291,13 @@ def align_drawing(
         fit_correlation=correlation_from_residual(grey, grey_residual),
         inner_pattern_correlation=inner_pattern_correlation,
         pattern_to_border_contrast_ratio=pattern_to_border_contrast_ratio,
-        largest_cell_grey_deviation_to_contrast_ratio=_largest_cell_grey_deviation(
+        largest_cell_grey_residual_to_contrast_ratio=_largest_cell_grey_residual(
             grey_residual / contrast_grey, grid, len(drawing.cell_whiteness)
         ),
         worst_cell_opposite_colour_likeness=worst_cell_opposite_colour_likeness,
         largest_opposite_colour_likeness_sigma=largest_opposite_colour_likeness_sigma,
         blur_sigma_px=rendered_drawing.blur_sigma_nodes * node_px,
-        largest_motion_from_start_px=float(np.abs(corners_px - start_corners_px).max()),
+        largest_corner_motion_from_start_px=float(np.abs(corners_px - start_corners_px).max()),
     )
 
 
@@ -302,12 +311,12 @@ def _make_normal_equations(
     towards zero."""
     rows, products = rendered_drawing.illumination_basis
     A = products + 1e-6 * np.eye(len(products))
-    A[TONE_CURVE_BEND_INDEX, TONE_CURVE_BEND_INDEX] += 1e-3 * len(
+    A[ILLUMINATION_TONE_CURVE_BEND_INDEX, ILLUMINATION_TONE_CURVE_BEND_INDEX] += 1e-3 * len(
         grey
     )  # keeps the bend at zero unless it is visible
     illumination = np.asarray(np.linalg.solve(A, np.einsum("kn,n->k", rows, grey)))
-    contrast_grey = float(illumination[GAIN_INDEX])
-    if contrast_grey < _MIN_FITTED_CONTRAST_GREY:
+    contrast_grey = float(illumination[ILLUMINATION_GAIN_INDEX])
+    if contrast_grey < _MIN_CONTRAST_TO_CONTINUE_FIT_GREY:
         return None
     grey_residual = grey - np.einsum("kn,k->n", rows, illumination)
     J = np.concatenate(
@@ -320,11 +329,12 @@ def _make_normal_equations(
     noise = max(float((grey_residual**2).mean()), 1.0)
     products = gram_matrix(J) / noise
     J, N, g = J[:-1], products[:-1, :-1], products[:-1, -1]
-    bend = _FIRST_ILLUMINATION_INDEX + TONE_CURVE_BEND_INDEX
+    bend = _FIRST_ILLUMINATION_INDEX + ILLUMINATION_TONE_CURVE_BEND_INDEX
     N[_BLUR_VARIANCE_INDEX, _BLUR_VARIANCE_INDEX] += 1.0  # limits the step to about a node's width
-    N[bend, bend] += (_TONE_CURVE_BEND_PRIOR_SIGMA * contrast_grey) ** -2.0
+    N[bend, bend] += (_TONE_CURVE_BEND_TO_GAIN_PRIOR_SIGMA * contrast_grey) ** -2.0
     g[bend] -= (
-        illumination[TONE_CURVE_BEND_INDEX] * (_TONE_CURVE_BEND_PRIOR_SIGMA * contrast_grey) ** -2.0
+        illumination[ILLUMINATION_TONE_CURVE_BEND_INDEX]
+        * (_TONE_CURVE_BEND_TO_GAIN_PRIOR_SIGMA * contrast_grey) ** -2.0
     )
     N[range(_FIRST_ILLUMINATION_INDEX, len(g)), range(_FIRST_ILLUMINATION_INDEX, len(g))] += 1e-6
     N[range(8), range(8)] += _HOMOGRAPHY_INCREMENT_PRIOR_INFORMATION
@@ -388,7 +398,7 @@ def _measure_inner_pattern_match(
     white. Both are 0 if nothing remains."""
     rows, products = drawing.black_square_illumination_basis
     A = products + 1e-9 * np.eye(len(products))
-    both = drawing.illumination_basis[0][GAIN_INDEX], grey
+    both = drawing.illumination_basis[0][ILLUMINATION_GAIN_INDEX], grey
     b = np.stack([np.einsum("kn,n->k", rows, each) for each in both], axis=1)
     shares = np.linalg.solve(A, b)
     bits, seen = (each - np.einsum("kn,k->n", rows, shares[:, k]) for k, each in enumerate(both))
@@ -414,7 +424,7 @@ def _estimate_nodes_per_independent_sample(grey_residual: Array) -> float:
     return factor
 
 
-def _largest_cell_grey_deviation(
+def _largest_cell_grey_residual(
     residual_per_contrast: Array, grid: SamplingGrid, cells_per_side: int
 ) -> float:
     index, count = _assign_nodes_to_cells(grid, cells_per_side)
@@ -447,15 +457,21 @@ def _grey_jacobian_under_illumination(drawing: RenderedDrawing, illumination: Ar
     the increment of the homography (8) and the variance of the blur (1), in squared node spacings.
     `illumination` (7 or 8,) contains the coefficients of the illumination, which converts the
     drawing to grey values, one per row of `RenderedDrawing.illumination_basis`."""
-    contrast_grey, (u, v, _) = float(illumination[GAIN_INDEX]), drawing.grid.node_uv1
+    contrast_grey, (u, v, _) = float(illumination[ILLUMINATION_GAIN_INDEX]), drawing.grid.node_uv1
     (white, changes), *others = drawing.blurred_whiteness_and_off_paper_fraction
-    bend = min(max(float(illumination[TONE_CURVE_BEND_INDEX]) / contrast_grey, -0.9), 0.9)
+    bend = min(
+        max(float(illumination[ILLUMINATION_TONE_CURVE_BEND_INDEX]) / contrast_grey, -0.9), 0.9
+    )
     slope = (
-        contrast_grey + illumination[GAIN_SLOPE_U_INDEX] * u + illumination[GAIN_SLOPE_V_INDEX] * v
+        contrast_grey
+        + illumination[ILLUMINATION_GAIN_SLOPE_U_INDEX] * u
+        + illumination[ILLUMINATION_GAIN_SLOPE_V_INDEX] * v
     )
     slope = slope * (1.0 + bend * (1.0 - 2.0 * white))
     change: Array = changes * slope
-    for (_, more), height in zip(others, illumination[OFF_PAPER_GREY_INDEX:], strict=True):
+    for (_, more), height in zip(
+        others, illumination[ILLUMINATION_OFF_PAPER_GREY_INDEX:], strict=True
+    ):
         change += more * height
     return change
 
@@ -463,7 +479,7 @@ def _grey_jacobian_under_illumination(drawing: RenderedDrawing, illumination: Ar
 # --- A grid over a marker in its own coordinates, and the image at its nodes ---
 
 
-_CHEBYSHEV_NODES_PER_AXIS = 9
+_DISTORTION_CHEBYSHEV_NODES_PER_AXIS = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -523,19 +539,20 @@ def lens_distortion_shift_px(
     node_uv1, between = _make_chebyshev_nodes(grid)
     pin = project_nodes(H_pinhole_marker, node_uv1)
     shift = (distort_px(pin, camera) - pin).reshape(
-        2, _CHEBYSHEV_NODES_PER_AXIS, _CHEBYSHEV_NODES_PER_AXIS
+        2, _DISTORTION_CHEBYSHEV_NODES_PER_AXIS, _DISTORTION_CHEBYSHEV_NODES_PER_AXIS
     )
     return np.asarray((between @ shift @ between.T).reshape(2, -1))
 
 
 @lru_cache(maxsize=64)
 def _make_chebyshev_nodes(grid: SamplingGrid) -> tuple[Array, Array]:
-    """Return the homogeneous coordinates (3, _CHEBYSHEV_NODES_PER_AXIS^2) of Chebyshev nodes over
-    the grid, in half sides from the marker's centre, and the weights (n, _CHEBYSHEV_NODES_PER_AXIS)
-    with which values at these nodes are interpolated at the grid's own nodes."""
+    """Return the homogeneous coordinates (3, _DISTORTION_CHEBYSHEV_NODES_PER_AXIS^2) of Chebyshev
+    nodes over the grid, in half sides from the marker's centre, and the weights (n,
+    _DISTORTION_CHEBYSHEV_NODES_PER_AXIS) with which values at these nodes are interpolated at the
+    grid's own nodes."""
     reach = float(grid.node_positions_half_sides[-1])
-    x = chebyshev.chebpts2(_CHEBYSHEV_NODES_PER_AXIS)
-    degree = _CHEBYSHEV_NODES_PER_AXIS - 1
+    x = chebyshev.chebpts2(_DISTORTION_CHEBYSHEV_NODES_PER_AXIS)
+    degree = _DISTORTION_CHEBYSHEV_NODES_PER_AXIS - 1
     through = np.linalg.inv(chebyshev.chebvander(x, degree))
     return _make_node_uv1(reach * x), chebyshev.chebvander(
         grid.node_positions_half_sides / reach, degree
@@ -607,14 +624,14 @@ _LOG_BLUR_TABLE_STEP = 0.02  # Relative step between the blurs in the table.
 # Rows of the illumination basis: offset and its slopes, gain and its slopes, bend of the tone
 # curve, grey beyond the sheet.
 (
-    BLACK_LEVEL_INDEX,
-    BLACK_LEVEL_SLOPE_U_INDEX,
-    BLACK_LEVEL_SLOPE_V_INDEX,
-    GAIN_INDEX,
-    GAIN_SLOPE_U_INDEX,
-    GAIN_SLOPE_V_INDEX,
-    TONE_CURVE_BEND_INDEX,
-    OFF_PAPER_GREY_INDEX,
+    ILLUMINATION_BLACK_LEVEL_INDEX,
+    ILLUMINATION_BLACK_LEVEL_SLOPE_U_INDEX,
+    ILLUMINATION_BLACK_LEVEL_SLOPE_V_INDEX,
+    ILLUMINATION_GAIN_INDEX,
+    ILLUMINATION_GAIN_SLOPE_U_INDEX,
+    ILLUMINATION_GAIN_SLOPE_V_INDEX,
+    ILLUMINATION_TONE_CURVE_BEND_INDEX,
+    ILLUMINATION_OFF_PAPER_GREY_INDEX,
 ) = range(8)
 
 
@@ -671,10 +688,13 @@ class RenderedDrawing:
             self.blur_sigma_nodes,
         )
         black = soft[
-            BLUR_MARGIN_NODES:-BLUR_MARGIN_NODES, BLUR_MARGIN_NODES:-BLUR_MARGIN_NODES
+            GRID_MARGIN_FOR_BLUR_NODES:-GRID_MARGIN_FOR_BLUR_NODES,
+            GRID_MARGIN_FOR_BLUR_NODES:-GRID_MARGIN_FOR_BLUR_NODES,
         ].reshape(1, -1)
         lit, _ = self.illumination_basis
-        rows = np.concatenate([lit[:GAIN_INDEX], black, lit[OFF_PAPER_GREY_INDEX:]])
+        rows = np.concatenate(
+            [lit[:ILLUMINATION_GAIN_INDEX], black, lit[ILLUMINATION_OFF_PAPER_GREY_INDEX:]]
+        )
         return rows, gram_matrix(rows)
 
     @cached_property
@@ -708,7 +728,7 @@ def _blur_with_jacobian(
 ) -> tuple[Array, Array]:
     soft = blur_node_values(sharp_node_values, blur_sigma_nodes)
     step = float(node_positions_half_sides[1] - node_positions_half_sides[0])
-    e, n = BLUR_MARGIN_NODES, len(node_positions_half_sides)
+    e, n = GRID_MARGIN_FOR_BLUR_NODES, len(node_positions_half_sides)
     middle = slice(e, e + n)
     left, right = soft[middle, e - 1 : e + n - 1], soft[middle, e + 1 : e + n + 1]
     up, down = soft[e - 1 : e + n - 1, middle], soft[e + 1 : e + n + 1, middle]

@@ -24,8 +24,8 @@ from perchctl.geometry import Array
 from perchctl.vision.markers.corners import is_inside_image, mean_side_px, scale_square
 from perchctl.vision.markers.detector import (
     MIRRORED_MARKER_ID,
-    OPENCV_DEFAULT_THRESHOLD_WINDOWS_PX,
-    QUICK_THRESHOLD_WINDOWS_PX,
+    OPENCV_DEFAULT_THRESHOLD_WINDOW_RANGE_PX,
+    QUICK_SEARCH_THRESHOLD_WINDOW_RANGE_PX,
     DetectorInput,
     ThresholdWindowRange,
     make_aruco_detector,
@@ -40,14 +40,14 @@ SearchMode = Literal[
 with OpenCV, "expected_fits" fits a blurred target at that position, and "near_expected" does both.
 "whole_sharp" searches the whole image with OpenCV, which needs a sharp target, and "whole_blurred"
 searches it for a blurred target. "all" combines all of these."""
-_WINDOW_MARGIN_TO_TARGET_SIZE_RATIO = 0.25
+_SEARCH_WINDOW_MARGIN_TO_TARGET_SIZE_RATIO = 0.25
 _MIN_SEARCH_WINDOW_MARGIN_PX = 24
 _MIN_SEARCH_WINDOW_SIDE_PX = 16
-_MAX_WINDOW_TO_IMAGE_AREA_RATIO = 0.8
-_MIN_MARKER_SIDE_TO_HALVE_IMAGE_PX = 60.0
+_MAX_SEARCH_WINDOW_TO_IMAGE_AREA_RATIO = 0.8
+_MIN_MARKER_SIDE_TO_SEARCH_HALF_SIZE_IMAGE_PX = 60.0
 """Markers whose sides, px, are longer than this are searched for in an image of half the size,
 which takes a quarter of the time."""
-_NESTING_TOLERANCE_SMALL_MARKER_SIDES = 0.35
+_MAX_NESTING_ERROR_TO_PAIR_MARKERS_SMALL_SIDES = 0.35
 
 
 ImageWindow = tuple[slice, slice]
@@ -55,7 +55,7 @@ ImageWindow = tuple[slice, slice]
 
 
 @dataclass(frozen=True, eq=False)
-class FoundMarkers:
+class MarkerSearchResult:
     """Result of a search with OpenCV's detector.
 
     Attributes:
@@ -76,7 +76,7 @@ def search_for_markers(
     expected_corners_px: Mapping[MarkerName, Array],
     search_mode: SearchMode = "all",
     measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None = None,
-) -> FoundMarkers:
+) -> MarkerSearchResult:
     """Search for the target's markers with OpenCV's detector, and return at most one large and one
     small marker, chosen by `choose_markers`.
 
@@ -98,7 +98,9 @@ def search_for_markers(
     setup, image_shape = detector_input.setup, detector_input.image.shape
     whole = slice(0, image_shape[0]), slice(0, image_shape[1])
 
-    def search_part(part: ImageWindow, threshold_windows_px: ThresholdWindowRange) -> FoundMarkers:
+    def search_part(
+        part: ImageWindow, threshold_windows_px: ThresholdWindowRange
+    ) -> MarkerSearchResult:
         return _search_window(
             detector_input,
             part,
@@ -117,38 +119,38 @@ def search_for_markers(
             make_search_window(expected_corners_px, setup.small_to_large_side_ratio, image_shape)
             or whole
         )
-        found = FoundMarkers()
+        found = MarkerSearchResult()
         if len(expected_corners_px) == 2:
-            found = search_part(window, QUICK_THRESHOLD_WINDOWS_PX)
+            found = search_part(window, QUICK_SEARCH_THRESHOLD_WINDOW_RANGE_PX)
         if len(found.corners_px) < 2 and window != whole:
-            found = search_part(window, OPENCV_DEFAULT_THRESHOLD_WINDOWS_PX)
+            found = search_part(window, OPENCV_DEFAULT_THRESHOLD_WINDOW_RANGE_PX)
         if len(found.corners_px) >= (2 if window == whole else 1) or (
             search_mode in ("near_expected", "expected_window") and window != whole
         ):
             return found
-    return search_part(whole, OPENCV_DEFAULT_THRESHOLD_WINDOWS_PX)
+    return search_part(whole, OPENCV_DEFAULT_THRESHOLD_WINDOW_RANGE_PX)
 
 
 def search_half_size_image(
     detector_input: DetectorInput,
     expected_corners_px: Mapping[MarkerName, Array],
     measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None = None,
-) -> FoundMarkers | None:
+) -> MarkerSearchResult | None:
     """Search the window around the expected markers in an image of half the size, which takes 1 ms.
     Return the markers found, with corners in pixels of the full-size image. The arguments are those
     of `search_for_markers`.
 
     Return None without a search unless both markers are expected, at least one of them completely
     in view, and the mean side of each one completely in view is longer than 60 px
-    (`_MIN_MARKER_SIDE_TO_HALVE_IMAGE_PX`). Also return None if fewer markers are found than are
-    expected to be completely in view.
+    (`_MIN_MARKER_SIDE_TO_SEARCH_HALF_SIZE_IMAGE_PX`). Also return None if fewer markers are found
+    than are expected to be completely in view.
     """
     image_shape = detector_input.image.shape
     in_view = [quad for quad in expected_corners_px.values() if is_inside_image(quad, image_shape)]
     if (
         len(expected_corners_px) < 2
         or not in_view
-        or min(map(mean_side_px, in_view)) <= _MIN_MARKER_SIDE_TO_HALVE_IMAGE_PX
+        or min(map(mean_side_px, in_view)) <= _MIN_MARKER_SIDE_TO_SEARCH_HALF_SIZE_IMAGE_PX
     ):
         return None
     window = make_search_window(
@@ -159,7 +161,7 @@ def search_half_size_image(
         detector_input,
         window,
         expected_corners_px,
-        QUICK_THRESHOLD_WINDOWS_PX,
+        QUICK_SEARCH_THRESHOLD_WINDOW_RANGE_PX,
         measure_marker_to_own_target_distance_m,
         must_halve_image=True,
     )
@@ -187,14 +189,15 @@ def make_search_window(
         corners = whole if inside else centre + 1.6 * (small - centre)
     low, high = corners.min(axis=0), corners.max(axis=0)
     margin = np.maximum(
-        _WINDOW_MARGIN_TO_TARGET_SIZE_RATIO * (high - low).max(), _MIN_SEARCH_WINDOW_MARGIN_PX
+        _SEARCH_WINDOW_MARGIN_TO_TARGET_SIZE_RATIO * (high - low).max(),
+        _MIN_SEARCH_WINDOW_MARGIN_PX,
     )
     left, top = np.clip(np.floor(low - margin), 0, (w, h)).astype(int)
     right, bottom = np.clip(np.ceil(high + margin), 0, (w, h)).astype(int)
     width, height = int(right - left), int(bottom - top)
     if (
         min(width, height) < _MIN_SEARCH_WINDOW_SIDE_PX
-        or width * height > _MAX_WINDOW_TO_IMAGE_AREA_RATIO * w * h
+        or width * height > _MAX_SEARCH_WINDOW_TO_IMAGE_AREA_RATIO * w * h
     ):
         return None
     return slice(int(top), int(bottom)), slice(int(left), int(right))
@@ -207,14 +210,14 @@ def _search_window(
     threshold_windows_px: ThresholdWindowRange,
     measure_marker_to_own_target_distance_m: MarkerToOwnTargetDistanceFunction | None,
     must_halve_image: bool = False,
-) -> FoundMarkers:
+) -> MarkerSearchResult:
     setup, part = detector_input.setup, detector_input.image[window]
     if must_halve_image:
         part = np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
     detector = make_aruco_detector(setup, (part.shape[1], part.shape[0]), threshold_windows_px)
     corners, ids, _, which = detector.detectMarkersMultiDict(part)
     if ids is None or len(corners) == 0:
-        return FoundMarkers()
+        return MarkerSearchResult()
     rows, columns = window
     first = np.array([columns.start, rows.start], dtype=np.float64)
     candidates: dict[MarkerName, list[Array]] = {"large": [], "small": []}
@@ -234,7 +237,7 @@ def _search_window(
         setup.small_to_large_side_ratio,
         measure_marker_to_own_target_distance_m,
     )
-    return FoundMarkers(chosen, is_mirrored_marker_seen, targets)
+    return MarkerSearchResult(chosen, is_mirrored_marker_seen, targets)
 
 
 def choose_markers(
@@ -355,12 +358,12 @@ def nesting_error_to_tolerance_ratio(
 ) -> float:
     """Return the largest distance of the small marker's corners from their expected positions
     inside the large one, divided by the allowed distance,
-    `_NESTING_TOLERANCE_SMALL_MARKER_SIDES` sides of the small marker, but at least 2.5 px. The two
-    markers form a target if the result is at most 1. `small_to_large_side_ratio` is the side of the
-    small marker divided by the side of the large one."""
+    `_MAX_NESTING_ERROR_TO_PAIR_MARKERS_SMALL_SIDES` sides of the small marker, but at least 2.5 px.
+    The two markers form a target if the result is at most 1. `small_to_large_side_ratio` is the
+    side of the small marker divided by the side of the large one."""
     mapped = scale_square(large_corners_px, small_to_large_side_ratio)
     side_px = mean_side_px(mapped)
-    allowed_px = max(_NESTING_TOLERANCE_SMALL_MARKER_SIDES * side_px, 2.5)
+    allowed_px = max(_MAX_NESTING_ERROR_TO_PAIR_MARKERS_SMALL_SIDES * side_px, 2.5)
     return float(np.linalg.norm(mapped - small_corners_px, axis=1).max()) / allowed_px
 
 

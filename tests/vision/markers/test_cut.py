@@ -24,7 +24,7 @@ from perchctl.vision import (
 from perchctl.vision.lens import distort_to_px, undistort_px, undistort_to_normalised
 from perchctl.vision.markers.corners import is_inside_image
 from perchctl.vision.markers.cut import (
-    MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S,
+    MAX_TARGET_MEASUREMENT_AGE_TO_TRY_TRUNCATED_FIT_S,
     RigidPose,
     fit_pose,
     fit_truncated_markers,
@@ -104,8 +104,12 @@ def test_it_is_never_a_first_sight_nor_one_after_a_while() -> None:
     assert nothing(detect_markers(frame(image), None, SETUP, CAMERA, expected))
     empty = Detections(-1, -1 / 30)
     assert nothing(detect_markers(frame(image), empty, SETUP, CAMERA, expected))
-    assert not nothing(search_mode("height", age_s=MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S - 0.01))
-    assert nothing(search_mode("height", age_s=MAX_MEASUREMENT_AGE_FOR_TRUNCATED_FIT_S + 0.01))
+    assert not nothing(
+        search_mode("height", age_s=MAX_TARGET_MEASUREMENT_AGE_TO_TRY_TRUNCATED_FIT_S - 0.01)
+    )
+    assert nothing(
+        search_mode("height", age_s=MAX_TARGET_MEASUREMENT_AGE_TO_TRY_TRUNCATED_FIT_S + 0.01)
+    )
 
 
 def test_a_target_that_was_whole_is_searched_for_wherever_it_is_expected() -> None:

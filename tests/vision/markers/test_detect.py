@@ -22,7 +22,7 @@ from perchctl.vision.markers.detect import (
     refine_expected_markers,
 )
 from perchctl.vision.markers.detector import DetectorInput, make_detector_setup
-from perchctl.vision.markers.pattern import BLUR_MARGIN_NODES, render_cells
+from perchctl.vision.markers.pattern import GRID_MARGIN_FOR_BLUR_NODES, render_cells
 from perchctl.vision.markers.search import nesting_error_to_tolerance_ratio
 from perchctl.vision.types import Detection, Detections
 from tests.helpers.corner_views import VIEWS, View, findings
@@ -220,7 +220,7 @@ def test_a_marker_is_fitted_as_it_is_printed(large_id: int) -> None:
     drawing = make_detector_setup(DetectorConfig(), target).patterns["large"].drawing
     n = 240
     axis = (2.0 * np.arange(n) + 1.0) / n - 1.0
-    inner = slice(BLUR_MARGIN_NODES, -BLUR_MARGIN_NODES)
+    inner = slice(GRID_MARGIN_FOR_BLUR_NODES, -GRID_MARGIN_FOR_BLUR_NODES)
     white = render_cells(drawing, axis, 1.0 / n)[inner, inner]
     printed = 1.0 - draw_target(target).ink_coverage(n / target.large.side_m, n)
     assert np.abs(white - printed).max() < 1e-5
