@@ -624,10 +624,14 @@ def _transfer_weight_to_magnet(c: Context) -> Action:
 
 
 def _complete_weight_transfer_to_magnet(c: Context) -> Action:
-    """Return the new state and command of a weight transfer that has begun. If the attitude in the
-    telemetry is older than `safety.telemetry_hold_s`, a fall could not be detected, so the transfer
-    starts over, with a thrust of at most `MIN_COMMANDED_TO_HOVER_THRUST_RATIO` of the hover thrust:
-    a hanging vehicle stays in place, and a fallen one does not climb."""
+    """Return the new state and command of a weight transfer that has begun: the thrust continues to
+    fall until the magnet carries the vehicle (`_transfer_weight_to_magnet`). A fall is caught
+    before this function is called.
+
+    If the attitude in the telemetry is older than `safety.telemetry_hold_s`, a fall could not be
+    detected, so the transfer starts over, with a thrust of at most
+    `MIN_COMMANDED_TO_HOVER_THRUST_RATIO` of the hover thrust: a hanging vehicle stays in place, and
+    a fallen one does not climb."""
     if c.belief.attitude_age_s <= c.safety.telemetry_hold_s:
         return _transfer_weight_to_magnet(c)
     part = MIN_COMMANDED_TO_HOVER_THRUST_RATIO * c.belief.hover_thrust

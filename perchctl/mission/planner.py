@@ -84,7 +84,7 @@ def _update_before_decision(
         )
         consecutive_target_frames = consecutive_target_frames + 1 if measured else 0
         if measured and is_hovering(state):
-            state = _accumulate_hover_error(state, obs, profile)
+            state = _add_target_error_to_hover_statistics(state, obs, profile)
     hold = hold_reason(state.belief, maneuver)
     condition_start_times_s = update_condition_start_times(
         state.condition_start_times_s, PHASE_TIMED_CONDITIONS, Context(state), obs.t_s
@@ -98,7 +98,7 @@ def _update_before_decision(
     return replace(state, battery=compute_battery_outlook(Context(state)))
 
 
-def _accumulate_hover_error(
+def _add_target_error_to_hover_statistics(
     state: PlannerState, obs: Observation, profile: Profile
 ) -> PlannerState:
     """Return the state with one more frame counted in `state.hover_errors`: the vector from the

@@ -75,7 +75,7 @@ class CameraFindings:
 
     measured_latency_s: float
     latency_sigma_s: float
-    mount_rotation_from_profile_xyz_deg: tuple[float, float, float]
+    mount_rotation_relative_to_profile_xyz_deg: tuple[float, float, float]
     mount_rotation_sigma_xyz_deg: tuple[float, float, float]
     advice: tuple[str, ...] = ()
 
@@ -109,7 +109,7 @@ class CameraFindings:
                 f"as in the profile: set camera.latency_s to {max(0.0, latency_s):.3f}"
             )
         turns = zip(
-            found.mount_rotation_from_profile_xyz_deg,
+            found.mount_rotation_relative_to_profile_xyz_deg,
             found.mount_rotation_sigma_xyz_deg,
             strict=True,
         )
@@ -134,7 +134,9 @@ class CameraFindings:
         """The rotation about x, y and z with 95 % intervals, for example ``0.2 +- 0.6, -0.1 +- 0.6,
         0.4 +- 1.8 deg``."""
         each = zip(
-            self.mount_rotation_from_profile_xyz_deg, self.mount_rotation_sigma_xyz_deg, strict=True
+            self.mount_rotation_relative_to_profile_xyz_deg,
+            self.mount_rotation_sigma_xyz_deg,
+            strict=True,
         )
         return (
             ", ".join(

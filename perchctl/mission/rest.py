@@ -19,7 +19,7 @@ MIN_HEIGHT_TO_INFER_HANGING_M = 0.45
 with the height at the start of a descent or with the present height."""
 MAX_HEIGHT_TO_COUNT_AS_ON_FLOOR_M = 0.3
 """Height up to which a vehicle with its motors off counts as being on the floor, m."""
-MAX_HEIGHT_LOSS_TO_COUNT_AS_STILL_HANGING_M = 0.15
+MAX_HEIGHT_LOSS_TO_COUNT_AS_STILL_HANGING_WITH_MOTORS_OFF_M = 0.15
 """Height loss below which a vehicle counts as still hanging where the descent began, m. Larger: a
 vehicle on a table seems to hang. Smaller: with a drifting estimate, a hanging vehicle seems to have
 come off."""
@@ -49,9 +49,10 @@ def find_rest_state(c: Context) -> RestState:
       estimate starts again at the origin, so earlier positions and sightings are not used.
     - All other cases: HANGS if the target is not known to be too far above to hold the vehicle, and
       the height shows that it has not come down. This is so if it has lost less than
-      `MAX_HEIGHT_LOSS_TO_COUNT_AS_STILL_HANGING_M` of height in the present phase, which began more
-      than `MIN_HEIGHT_TO_INFER_HANGING_M` above the ground, or if a contact is recorded and it is
-      more than `MAX_HEIGHT_TO_COUNT_AS_ON_FLOOR_M` above the ground. STANDS otherwise.
+      `MAX_HEIGHT_LOSS_TO_COUNT_AS_STILL_HANGING_WITH_MOTORS_OFF_M` of height in the present phase,
+      which began more than `MIN_HEIGHT_TO_INFER_HANGING_M` above the ground, or if a contact is
+      recorded and it is more than `MAX_HEIGHT_TO_COUNT_AS_ON_FLOOR_M` above the ground. STANDS
+      otherwise.
     """
     b, state = c.belief, c.state
     if _is_held_by_other_object(c):
@@ -67,7 +68,7 @@ def find_rest_state(c: Context) -> RestState:
     stayed = (
         high
         and not b.target.is_too_far_above_to_hold_vehicle
-        and came_down_m < MAX_HEIGHT_LOSS_TO_COUNT_AS_STILL_HANGING_M
+        and came_down_m < MAX_HEIGHT_LOSS_TO_COUNT_AS_STILL_HANGING_WITH_MOTORS_OFF_M
     )
     at_contact = (
         b.vehicle_world_z_at_last_contact_m is not None
@@ -85,7 +86,7 @@ def _is_held_by_other_object(c: Context) -> bool:
     if (
         b.is_position_valid
         and state.entry.vehicle_world_position_m[2] - b.telemetry.position_m[2]
-        >= MAX_HEIGHT_LOSS_TO_COUNT_AS_STILL_HANGING_M
+        >= MAX_HEIGHT_LOSS_TO_COUNT_AS_STILL_HANGING_WITH_MOTORS_OFF_M
     ):
         return False
     if VehicleDiagnosis.HELD_BY_OTHER_OBJECT in state.entry.diagnosis:

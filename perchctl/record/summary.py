@@ -234,7 +234,7 @@ _HOVER = {
 _FINDINGS = {
     "latency_s": "measured_latency_s",
     "latency_sigma_s": "latency_sigma_s",
-    "mount_turn_deg": "mount_rotation_from_profile_xyz_deg",
+    "mount_turn_deg": "mount_rotation_relative_to_profile_xyz_deg",
     "mount_turn_sigma_deg": "mount_rotation_sigma_xyz_deg",
     "advice": "advice",
 }

@@ -198,8 +198,9 @@ CASES: dict[str, Case] = {
     ),
     "mounting": Case(
         P.ALIGN, P.LANDING, seen(), 0.1, O.SAFETY,
-        state={"mounting":
-        CameraMountingMonitor(contradicting_sighting_count=MIN_CONTRADICTING_SIGHTINGS_TO_JUDGE_MOUNTING_WRONG)},
+        state={"camera_mounting_monitor": CameraMountingMonitor(
+            contradicting_sighting_count=MIN_CONTRADICTING_SIGHTINGS_TO_JUDGE_MOUNTING_WRONG
+        )},
     ),
     "height-limit": Case(P.SEARCH, P.LANDING, unseen(3.4), 0.1, O.SAFETY, z_m=3.4),
     "fence": Case(P.ALIGN, P.LANDING, aside(2.5), 0.1, O.SAFETY),

@@ -751,7 +751,7 @@ _PROFILE_HALF_LENGTH_PER_ITERATION_PX = (14.0, 10.0, 8.0, 8.0, 8.0, 8.0)
 _MAX_PROFILE_HALF_LENGTH_CELLS, _MIN_PROFILE_HALF_LENGTH_PX = 0.4, 3.0
 # A step below the first limit ends the fit. If the last step exceeds the second limit, the fit has
 # failed.
-_MAX_STEP_TO_COUNT_AS_CONVERGED_PX, _MAX_FINAL_STEP_TO_ACCEPT_FIT_PX = 0.02, 0.5
+_MAX_TRUNCATED_FIT_STEP_TO_COUNT_AS_CONVERGED_PX, _MAX_FINAL_STEP_TO_ACCEPT_FIT_PX = 0.02, 0.5
 # Minimum contrast of an edge: in grey levels, and as a fraction of the median contrast.
 _MIN_CONTRAST_TO_COUNT_AS_EDGE_GREY, _MIN_EDGE_TO_MEDIAN_CONTRAST_RATIO = 8.0, 0.35
 _MIN_EDGE_POINTS_TO_FIT = 24
@@ -883,7 +883,8 @@ def fit_pose(
 ) -> PoseFit | None:
     """Fit the pose of the drawing in the camera frame by Gauss-Newton steps from `start`, so that
     the projected edges of `outline` match the edges in the distorted image (h, w). Edge points with
-    a profile over pixels at which `hidden_mask_u8` (h, w) is not zero are not used.
+    a profile over pixels at which `hidden_mask_u8` (h, w) is not zero are not used. Both poses have
+    their translation in half sides of the large marker.
 
     Returns None if fewer than 24 edge points (`_MIN_EDGE_POINTS_TO_FIT`) are in view or found, if
     the robust fit rejects too many of them, or if it does not converge. A result that is not None
@@ -927,7 +928,7 @@ def fit_pose(
         moved_px = float(
             np.abs(edge_points.normal_motion_jacobian_wrt_pose_and_shift[:, :6] @ step).max()
         )
-        if moved_px < _MAX_STEP_TO_COUNT_AS_CONVERGED_PX:
+        if moved_px < _MAX_TRUNCATED_FIT_STEP_TO_COUNT_AS_CONVERGED_PX:
             break
     if fit_step is None or not (
         moved_px <= _MAX_FINAL_STEP_TO_ACCEPT_FIT_PX and pose.t_cam_drawing_half_sides[2] > 0.0

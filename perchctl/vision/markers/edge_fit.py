@@ -369,7 +369,7 @@ def _refine_corners_by_lines_once(
     return found
 
 
-def _fit_lines(markers: MarkerSides, outer_edges: MeasuredEdges) -> tuple[Array, Array]:
+def _fit_lines(markers: UnfittedMarkerSides, outer_edges: MeasuredEdges) -> tuple[Array, Array]:
     """Fit a line to the edge points of each side of m markers by weighted total least squares.
     Return the coefficients (nx, ny, c) of each line, (4m, 3), with n.x = c and |n| = 1 in
     normalised image coordinates, and the weighted RMS distance of the points from each line, px
@@ -430,7 +430,7 @@ def edge_shift_prior_sigma_px(white_grey: float) -> float:
 
 
 def _measure_edge_shift(
-    markers: MarkerSides,
+    markers: UnfittedMarkerSides,
     outer_edges: MeasuredEdges,
     inner_edges: MeasuredEdges | None,
     line_nx_ny_c: Array,
@@ -509,7 +509,10 @@ def _measure_edge_shift(
 
 
 def _measure_outward_bow_of_side_ends_px(
-    markers: MarkerSides, outer_edges: MeasuredEdges, line_nx_ny_c: Array, rms_residual_px: Array
+    markers: UnfittedMarkerSides,
+    outer_edges: MeasuredEdges,
+    line_nx_ny_c: Array,
+    rms_residual_px: Array,
 ) -> float:
     """Return by how many pixels the ends of the sides of the marker with the widest cells are
     further out than their middles, as on a curled sheet; negative if the middles are further out. A
@@ -545,7 +548,7 @@ def _measure_outward_bow_of_side_ends_px(
     )
 
 
-def _line_normal_outward_signs(markers: MarkerSides, line_nx_ny_c: Array) -> Array:
+def _line_normal_outward_signs(markers: UnfittedMarkerSides, line_nx_ny_c: Array) -> Array:
     """Return a sign (4m,) for each line: +1 if its normal, the first two columns of `line_nx_ny_c`
     (4m, 3), points out of its marker, -1 if it points into it. A line can have either sign because
     (n, c) and (-n, -c) describe the same line."""
@@ -555,7 +558,10 @@ def _line_normal_outward_signs(markers: MarkerSides, line_nx_ny_c: Array) -> Arr
 
 
 def _are_markers_accepted(
-    markers: MarkerSides, outer_edges: MeasuredEdges, rms_residual_px: Array, corners_px: Array
+    markers: UnfittedMarkerSides,
+    outer_edges: MeasuredEdges,
+    rms_residual_px: Array,
+    corners_px: Array,
 ) -> NDArray[np.bool_]:
     inliers = np.count_nonzero(outer_edges.edge_point_weight > 0.0, axis=1)
     # Contrast between two samples near the ends of each profile: dark inside, white outside.
@@ -640,7 +646,7 @@ _SIDE_INDICES = np.arange(4)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
-class MarkerSides:
+class UnfittedMarkerSides:
     """The sides of m markers before their edges are measured. Side k runs from corner k to corner
     k + 1.
 
@@ -696,7 +702,7 @@ class MeasuredEdges:
 
 def prepare_marker_sides(
     raw_corners_px: Array, cells_along_border: Sequence[CellsAlongBorder], camera: CameraModel
-) -> MarkerSides | None:
+) -> UnfittedMarkerSides | None:
     """Return the sides of m markers with corners (m, 4, 2) px in the distorted image.
     `cells_along_border` describes the cells just inside each marker's border. Returns None if the
     corners of any marker are degenerate (two coincide, or the area is zero), or if the lens model
@@ -713,7 +719,7 @@ def prepare_marker_sides(
     along = corners.take(NEXT_CORNER, axis=1) - corners
     across_px = sides_px.take(PREVIOUS_CORNER, axis=1) + sides_px.take(NEXT_CORNER, axis=1)
     cell_size_px = sides_px @ _MEAN_OF_FOUR_WEIGHTS / cells
-    return MarkerSides(
+    return UnfittedMarkerSides(
         raw_corners_px=raw_corners_px,
         cells_along_border=cells_along_border,
         corners_normalised=corners,
@@ -729,7 +735,7 @@ def prepare_marker_sides(
 
 def measure_edges(
     image: NDArray[np.uint8],
-    markers: MarkerSides,
+    markers: UnfittedMarkerSides,
     camera: CameraModel,
     must_measure_inner_edges: bool,
 ) -> tuple[MeasuredEdges, MeasuredEdges | None]:

@@ -75,7 +75,7 @@ from perchctl.vision.types import CameraModel, EdgeShiftEstimate, MarkerName
 
 # With smaller cells, a part of a side carries no information.
 MIN_CELL_SIZE_TO_TRY_PARTIAL_FIT_PX = 4.0
-_MAX_FIT_ITERATIONS, _MAX_STEP_TO_COUNT_AS_CONVERGED_PX = 5, 0.05
+_MAX_PARTIAL_FIT_ITERATIONS, _MAX_STEP_TO_COUNT_AS_CONVERGED_PX = 5, 0.05
 _MAX_EDGE_FIT_RMS_RESIDUAL_PX = 0.6
 _MAX_BLUR_SIGMA_TO_WINDOW_HALF_LENGTH_RATIO = 0.9
 # Corners with a larger standard deviation are rejected.
@@ -122,7 +122,7 @@ def fit_partly_visible_marker(
     if not np.isfinite(start).all() or side_lengths_px(start).min() < 1.0:
         return None
     H_pinhole_marker = homography_from_centred_square(start)
-    for k in range(_MAX_FIT_ITERATIONS):
+    for k in range(_MAX_PARTIAL_FIT_ITERATIONS):
         visible_edges = find_visible_edges(detector_input, H_pinhole_marker, pattern)
         if visible_edges is None:
             return None

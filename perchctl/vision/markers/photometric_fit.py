@@ -53,7 +53,7 @@ from perchctl.vision.types import CameraModel
 
 _MAX_GRID_NODES_PER_SIDE, _MIN_GRID_NODES_PER_SIDE = 44, 18
 _NOMINAL_NODE_SPACING_PX = 0.8
-_MAX_FIT_ITERATIONS = 12
+_MAX_PHOTOMETRIC_FIT_ITERATIONS = 12
 _ITERATIONS_BEFORE_CORRELATION_CHECK, _MIN_CORRELATION_TO_CONTINUE_FIT = 4, 0.7
 """Number of iterations after which the fit fails unless its correlation has reached
 `_MIN_CORRELATION_TO_CONTINUE_FIT`. The correlation of a marker is above 0.9 after two
@@ -210,7 +210,7 @@ def align_drawing(
         0.0,
         np.zeros(8),
     )
-    for k in range(_MAX_FIT_ITERATIONS):
+    for k in range(_MAX_PHOTOMETRIC_FIT_ITERATIONS):
         if since_lens_px > _MAX_MARKER_MOTION_TO_REUSE_DISTORTION_PX:
             distortion_shift_minus_patch_corner_px, since_lens_px = (
                 lens_distortion_shift_px(grid, H_pinhole_marker, camera) - first,

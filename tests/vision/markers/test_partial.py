@@ -255,7 +255,7 @@ def test_behind_a_leg_the_marker_is_measured_by_the_rest(name: str) -> None:
         find_visible_edges(DetectorInput(bare, gear, SETUP, CAMERA), at, LARGE)
         for gear in (None, covered)
     ]
-    whole, rest = (edges.weight.sum() for edges in seen)
+    whole, rest = (edges.profile_weight.sum() for edges in seen)
     assert (rest < 0.95 * whole) == (name != "corner"), "no side that is hidden counts"
     setup, found = replace(SETUP, static_hidden_mask=covered), []
     for grey in (0, 120, 255):
