@@ -123,7 +123,9 @@ def _seen(frames: list[tuple[float, Picture]], pipeline: Any) -> tuple[Any, ...]
     pose = next((output.poses[n] for n in ("joint", "large", "small") if n in output.poses), None)
     if pose is None:
         return t_s, markers, None, None
-    return t_s, markers, np.append(pose.e_m, pose.e_yaw_rad), pose.level_frame_xyz_yaw_cov
+    cov = getattr(pose, "level_frame_xyz_yaw_cov", None)
+    cov = pose.xyz_yaw_cov if cov is None else cov  # its former name
+    return t_s, markers, np.append(pose.e_m, pose.e_yaw_rad), cov
 
 
 def _serve() -> None:

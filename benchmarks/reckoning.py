@@ -266,10 +266,10 @@ def _blind(
                 left.pop(0),
                 [
                     (
-                        float(np.linalg.norm(np.subtract(old.velocity_mps[:2], v[:2]))),
+                        float(np.linalg.norm(np.subtract(old.velocity_world_mps[:2], v[:2]))),
                         float(np.linalg.norm(found[:2, 1] - v[:2])),
                     ),
-                    (abs(old.velocity_mps[2] - v[2]), abs(float(found[2, 1] - v[2]))),
+                    (abs(old.velocity_world_mps[2] - v[2]), abs(float(found[2, 1] - v[2]))),
                     (
                         float(np.linalg.norm(old_way_m - way_m[:2])),
                         float(np.linalg.norm(found[:2, 0] - way_m[:2])),
