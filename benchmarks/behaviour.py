@@ -97,7 +97,8 @@ def print_decisions(log: Path) -> None:
             "attempts": new.failed_attempts,
             "command": [type(command).__name__, to_exact_json(command)],
             "outcome": None if new.outcome is None else new.outcome.value,
-            "reason": new.transition_reason,
+            # An older checkout has it under its former name.
+            "reason": new.transition_reason if hasattr(new, "transition_reason") else new.reason,
         }
         print(json.dumps(decided))
         if turn.role == "flown":
