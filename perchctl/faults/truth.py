@@ -384,10 +384,9 @@ class DescentBound:
         self._from_m: float | None = None  # the vehicle's height when the descent became due
 
     def begin(self, t_s: float, phase: Phase | None) -> None:
-        """Record when the fault began, and the program's phase at that time. Further calls do
-        nothing."""
+        """Record when the fault began, and the program's phase at that time, None before the
+        mission's first tick. Further calls do nothing."""
         if self._due_s is None:
-            phase = phase or Phase.APPROACH
             limits_s = [landing_due_s(effect, self._profile, phase) for effect in self._effects]
             self._due_s = t_s + min(limits_s, default=math.inf)
 
@@ -429,12 +428,19 @@ def _for_s(effect: e.Effect) -> float:
     return float(effect.keywords.get("for_s", e.FOR_EVER))
 
 
-def landing_due_s(effect: e.Effect, profile: Profile, phase: Phase) -> float:
+def landing_due_s(effect: e.Effect, profile: Profile, phase: Phase | None) -> float:
     """The time, s, from an effect's beginning in `phase` until the program must land; infinite if
-    it need not land."""
+    it need not land. `phase` is None before the mission's first tick: the effect then lasts into
+    the take-off, but a loop that stands still does not begin one until it runs again."""
     safety, values, limit_s = profile.safety, effect.keywords, math.inf
+    if phase is None:
+        if effect.func in (e.suspended, e.hung):
+            return math.inf
+        phase = Phase.APPROACH
     if effect.func is e.operator:
         limit_s = min(values["presses_s"])
+    elif effect.func is e.parent_gone:
+        limit_s = values["noticed_s"]
     elif effect.func is e.raises:
         limit_s = 0.0
     elif effect.func in (e.suspended, e.hung):

@@ -136,7 +136,7 @@ def positions(how: str) -> e.Effect:
 
 
 def befallen(
-    effect: e.Effect, profile: Profile = SIM, phase: Phase = P.ALIGN
+    effect: e.Effect, profile: Profile = SIM, phase: Phase | None = P.ALIGN
 ) -> Callable[..., bool]:
     """By the time since the effect befell it, and by what is not so of a vehicle that hovers on:
     is it overdue?"""
@@ -165,13 +165,17 @@ def befallen(
         (positions("late"), SIM, P.ALIGN, NEVER),
         (partial(e.deck_silent, for_s=EVER, acc_z_mps2=0.05), SIM, P.ALIGN, SIM.positioning.land_s),
         (partial(e.suspended, for_s=1.9), SIM, P.ALIGN, SAFETY.loop_late_land_s),
+        (partial(e.suspended, for_s=1.9), SIM, None, NEVER),  # on the floor, before the first tick
+        (partial(e.hung, for_s=5.0), SIM, None, NEVER),
+        (positions("silent"), SIM, None, SIM.positioning.land_s),
+        (partial(e.parent_gone, noticed_s=0.4, for_s=EVER), SIM, P.ALIGN, 0.4),
         (partial(e.raises), SIM, P.ALIGN, 0.0),
         (partial(e.operator, presses_s=(0.0, 4.0)), SIM, P.ALIGN, 0.0),
         (partial(e.operator, presses_s=(0.0,)), SIM, P.COMPLETE, NEVER),
     ],
 )
 def test_after_what_loss_it_comes_down_and_when(
-    effect: e.Effect, profile: Profile, phase: Phase, limit_s: float
+    effect: e.Effect, profile: Profile, phase: Phase | None, limit_s: float
 ) -> None:
     late_s = limit_s + REACTION_S + WATCHED_S
     is_overdue = befallen(effect, profile, phase)
