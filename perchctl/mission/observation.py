@@ -40,7 +40,7 @@ class Observation:
 
     `has_new_frame` is True if a good frame was processed in this tick. `heading_jump_rad` is the
     step of the estimated heading beyond any possible rotation, at least 0.
-    `consecutive_marker_conflict_frames` counts the frames in a row in which the two markers
+    `successive_marker_conflict_frames` counts the frames in a row in which the two markers
     contradict each other. `climb_withheld_reason` says why the fleet's parent process does not
     permit the climb, and `target_refusal_reason` why the last target in view was taken for another
     vehicle's. `rejected_sighting_to_estimate_distance_m` is the distance from the estimated
@@ -59,7 +59,7 @@ class Observation:
     has_estimated_position_jumped: bool = False
     heading_jump_rad: float = 0.0  #: step of the estimated heading beyond any possible rotation
     tick_start_delay_s: float = 0.0  #: delay of the start of this tick
-    consecutive_marker_conflict_frames: int = (
+    successive_marker_conflict_frames: int = (
         0  #: number of successive frames with contradicting markers
     )
     operator_request: OperatorRequest = OperatorRequest.NONE

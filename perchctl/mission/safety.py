@@ -538,7 +538,7 @@ SAFETY_ROWS: tuple[Transition, ...] = (
     land_row(
         "markers-disagree",
         CAMERA_GUIDED_PHASES,
-        lambda c: c.obs.consecutive_marker_conflict_frames >= c.profile.merge.disagreement_frames,
+        lambda c: c.obs.successive_marker_conflict_frames >= c.profile.merge.disagreement_frames,
         "the two markers contradict each other: check the printed sizes and the calibration",
     ),
     land_row(

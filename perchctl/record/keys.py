@@ -80,7 +80,7 @@ FIELD_KEYS: dict[str, dict[str, str]] = {
         "camera_latency_above_profile_s": "delay_s",
         "camera_latency_sigma_s": "delay_sigma_s",
         "flight_log_problem": "log_problem",
-        "consecutive_marker_conflict_frames": "disagreeing_frames",
+        "successive_marker_conflict_frames": "disagreeing_frames",
         "visual_inertial_motion": "felt",
         "has_estimated_position_jumped": "jumped",
         "external_position_age_s": "position_age_s",

@@ -110,7 +110,7 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
     ),
     "loop-late": (_obs(tick_start_delay_s=1.2), 0.1, PRE_LANDING_PHASES, LAND, Outcome.SAFETY),
     "markers-disagree": (
-        _obs(consecutive_marker_conflict_frames=40), 0.1, CAMERA_PHASES, LAND, Outcome.SAFETY,
+        _obs(successive_marker_conflict_frames=40), 0.1, CAMERA_PHASES, LAND, Outcome.SAFETY,
     ),
     "time-over": (
         lambda o: o, 0.1, PRE_CONTACT_PHASES, LAND, Outcome.ATTEMPTS_USED_UP,

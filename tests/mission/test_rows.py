@@ -209,7 +209,7 @@ CASES: dict[str, Case] = {
         P.ALIGN, P.LANDING, seen(last_good_frame_age_s=4.0, has_new_frame=False), 0.1, O.SAFETY
     ),
     "loop-late": Case(P.ALIGN, P.LANDING, seen(tick_start_delay_s=1.2), 0.1, O.SAFETY),
-    "markers-disagree": Case(P.ALIGN, P.LANDING, seen(consecutive_marker_conflict_frames=40), 0.1,
+    "markers-disagree": Case(P.ALIGN, P.LANDING, seen(successive_marker_conflict_frames=40), 0.1,
         O.SAFETY),
     "log-lost": Case(
         P.ALIGN, P.LANDING, seen(flight_log_problem="disk full"), 0.1, O.SAFETY, profile=LAND_ON_LOG
